@@ -21,38 +21,22 @@ ATTRIBUTES = tuple(field.name for field in dataclasses.fields(Config))
 _INT, _PTR = ctypes.c_int, ctypes.c_void_p
 _PASSIVE = int(mujoco.mjtPluginCapabilityBit.mjPLUGIN_PASSIVE)
 _SENSOR = int(mujoco.mjtPluginCapabilityBit.mjPLUGIN_SENSOR)
-_CALLBACKS = {
-    "nstate": ctypes.CFUNCTYPE(_INT, _PTR, _INT),
-    "nsensordata": ctypes.CFUNCTYPE(_INT, _PTR, _INT, _INT),
-    "init": ctypes.CFUNCTYPE(_INT, _PTR, _PTR, _INT),
-    "destroy": ctypes.CFUNCTYPE(None, _PTR, _INT),
-    "copy": ctypes.CFUNCTYPE(None, _PTR, _PTR, _PTR, _INT),
-    "reset": ctypes.CFUNCTYPE(None, _PTR, _PTR, _PTR, _INT),
-    "compute": ctypes.CFUNCTYPE(None, _PTR, _PTR, _INT, _INT),
-    "advance": ctypes.CFUNCTYPE(None, _PTR, _PTR, _INT),
-    "visualize": ctypes.CFUNCTYPE(None, _PTR, _PTR, _PTR, _PTR, _INT),
-}
-
-_UNUSED = "act_dot sdf_distance sdf_gradient sdf_staticdistance sdf_attribute sdf_aabb".split()
-
-
-class _Plugin(ctypes.Structure):
-    """mjpPlugin of mjplugin.h."""
-
-    _fields_ = [
-        ("name", ctypes.c_char_p),
-        ("nattribute", _INT),
-        ("attributes", ctypes.POINTER(ctypes.c_char_p)),
-        ("capabilityflags", _INT),
-        ("needstage", _INT),
-        *_CALLBACKS.items(),
-        *((name, _PTR) for name in _UNUSED),
-    ]
-
+_callbacks = {}  # functions of mjpPlugin in its order, by their names
 
 _lock = threading.RLock()
 _worlds = {}  # mjData address -> World, all BioTacs in it; holds only what the state and the model determine
 _alive = []  # what C points to
+
+
+def _callback(*kinds, returns=None, **options):
+    """Makes a function one of mjpPlugin's by its name; kinds: ctypes of its arguments. options: of
+    `guarded`."""
+
+    def decorate(function):
+        made = ctypes.CFUNCTYPE(returns, *kinds)(guarded(**options)(function))
+        _callbacks[function.__name__.strip("_")] = made
+
+    return decorate
 
 
 def _raises(model, index):
@@ -78,19 +62,19 @@ def _world(model, data, index):
     return world
 
 
-@guarded(failed=-1)
+@_callback(_PTR, _INT, returns=_INT, failed=-1)
 def _nstate(model, index):
     from ..coupling.setup import state_size  # late: `import biotac_mj` loads neither Warp nor the geometry
 
     return state_size(structs.ModelView(model), index)
 
 
-@guarded(failed=0)
+@_callback(_PTR, _INT, _INT, returns=_INT, failed=0)
 def _nsensordata(model, index, sensor):
     return 0
 
 
-@guarded(failed=-1)
+@_callback(_PTR, _PTR, _INT, returns=_INT, failed=-1)
 def _init(model, data, index):
     with _lock:
         world = _worlds.get(data)
@@ -100,18 +84,18 @@ def _init(model, data, index):
     return 0
 
 
-@guarded()
+@_callback(_PTR, _INT)
 def _destroy(data, index):
     _worlds.pop(data, None)  # without the lock: a garbage collection calls this on any thread at any time
 
 
-@guarded()
+@_callback(_PTR, _PTR, _PTR, _INT)
 def _copy(destination, model, source, index):
     with _lock:
         _worlds.pop(destination, None)
 
 
-@guarded()
+@_callback(_PTR, _PTR, _PTR, _INT)
 def _reset(model, state, plugin_data, index):
     from ..coupling.setup import reset_state
 
@@ -121,7 +105,7 @@ def _reset(model, state, plugin_data, index):
     reset_state(structs.ModelView(model), state, index, setup)
 
 
-@guarded(raises=lambda model, data, index, capability: _raises(model, index), abandon=_abandon)
+@_callback(_PTR, _PTR, _INT, _INT, raises=lambda model, _, index, __: _raises(model, index), abandon=_abandon)
 def _compute(model, data, index, capability):
     world = _world(model, data, index)
     if index == world.begins:
@@ -132,14 +116,31 @@ def _compute(model, data, index, capability):
         world.sense_forces()
 
 
-@guarded(raises=lambda model, data, index: _raises(model, index))
+@_callback(_PTR, _PTR, _INT, raises=lambda model, _, index: _raises(model, index))
 def _advance(model, data, index):
     _world(model, data, index).commit(index)
 
 
-@guarded(raises=lambda model, data, option, scene, index: _raises(model, index))
+@_callback(*(_PTR,) * 4, _INT, raises=lambda model, *rest: _raises(model, rest[-1]))
 def _visualize(model, data, option, scene, index):
     _world(model, data, index).instances[index].visualize()
+
+
+_UNUSED = "act_dot sdf_distance sdf_gradient sdf_staticdistance sdf_attribute sdf_aabb".split()
+
+
+class _Plugin(ctypes.Structure):
+    """mjpPlugin of mjplugin.h."""
+
+    _fields_ = [
+        ("name", ctypes.c_char_p),
+        ("nattribute", _INT),
+        ("attributes", ctypes.POINTER(ctypes.c_char_p)),
+        ("capabilityflags", _INT),
+        ("needstage", _INT),
+        *((name, type(called)) for name, called in _callbacks.items()),
+        *((name, _PTR) for name in _UNUSED),
+    ]
 
 
 def register():
@@ -151,18 +152,6 @@ def register():
     with _lock:
         if _alive:
             return
-        functions = dict(
-            nstate=_nstate,
-            nsensordata=_nsensordata,
-            init=_init,
-            destroy=_destroy,
-            copy=_copy,
-            reset=_reset,
-            compute=_compute,
-            advance=_advance,
-            visualize=_visualize,
-        )
-        callbacks = {name: _CALLBACKS[name](function) for name, function in functions.items()}
         names = (ctypes.c_char_p * len(ATTRIBUTES))(*(name.encode() for name in ATTRIBUTES))
         plugin = _Plugin(
             name=PLUGIN_NAME.encode(),
@@ -170,7 +159,7 @@ def register():
             attributes=names,
             capabilityflags=_PASSIVE | _SENSOR,
             needstage=int(mujoco.mjtStage.mjSTAGE_ACC),
-            **callbacks,
+            **_callbacks,
         )
         slot = structs.LIBRARY.mjp_registerPlugin(ctypes.byref(plugin))
         if slot < 0:
@@ -178,7 +167,7 @@ def register():
                 f"MuJoCo {mujoco.__version__} refused the plugin {PLUGIN_NAME!r}: "
                 "is another copy of biotac_mj loaded?"
             )
-        _alive.extend((callbacks, names, plugin))
+        _alive.extend((names, plugin))
         atexit.register(_fall_silent, slot)
 
 
@@ -194,4 +183,4 @@ def _fall_silent(slot):
     interpreter would crash."""
     get = structs.LIBRARY.mjp_getPluginAtSlot
     get.restype, get.argtypes = ctypes.POINTER(_Plugin), (_INT,)
-    get(slot).contents.destroy = _CALLBACKS["destroy"]()  # none
+    get(slot).contents.destroy = type(_callbacks["destroy"])()  # none
