@@ -15,6 +15,8 @@ from .fem import FemStepper
 
 _PATIENCE = 0.75  # of two-way skins: somebody waits for the step, and the next one goes on
 
+_SAME = "wrench tangent converged iterations measured load_factor load cost slack".split()
+
 
 class CondensedStepper(FemStepper):
     """The condensed skin of one BioTac: settings, model and geoms are those of the full FEM.
@@ -64,21 +66,9 @@ class CondensedStepper(FemStepper):
         memory = self._read(state)
         begin = self._read(near.state) if near is not None and bodies is not None else None
         out = self._skin.solve(memory, geom_pos, geom_mat, 1 - spent, bodies, begin)
-        return SkinResult(
-            state=out.memory.row,
-            wrench=out.wrench,
-            tangent=out.tangent,
-            vert_xpos=out.vert_xpos[: self._geometry.nvert],
-            pressure=out.memory.pressure,
-            converged=out.converged,
-            iterations=out.iterations,
-            residual=out.error,
-            measured=out.measured,
-            load_factor=out.load_factor,
-            load=out.load,
-            cost=out.cost,
-            slack=out.slack,
-        )
+        same = {name: getattr(out, name) for name in _SAME}
+        vert, pressure = out.vert_xpos[: self._geometry.nvert], out.memory.pressure
+        return SkinResult(out.memory.row, vert_xpos=vert, pressure=pressure, residual=out.error, **same)
 
     def contact_force(self, state: np.ndarray) -> np.ndarray:
         return self._skin.contact_force(self._read(state))[: self._geometry.nvert]
