@@ -84,8 +84,6 @@ def accept_models(
     wrench: wp.array2d(dtype=vec6),
     tangent: wp.array2d(dtype=mat66),
     slack: wp.array2d(dtype=real),
-    fraction: wp.array(dtype=real),
-    path: wp.array(dtype=real),
     at_rest: wp.array(dtype=bool),
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
@@ -96,7 +94,7 @@ def accept_models(
 ):
     """Linear models of skins after a solve for poses pos, mat: about the poses that were reached. Where none
     was reached: the last step's model, or in a first step one about the target poses. No force where poses
-    are not finite. fraction, path: see `BatchSkin`."""
+    are not finite."""
     g, w = wp.tid()
     if st.wanted[w] == 0:
         return
@@ -120,7 +118,7 @@ def accept_models(
             p = turn * (p - geoms.pos[k, w]) + geoms.pos_last[k, w]
             R = turn * R
         model.wrench0[g, w] = wrench[g, w]
-        model.tangent0[g, w] = hold_by_rows(fraction[g] * path[g] * tangent[g, w])
+        model.tangent0[g, w] = hold_by_rows(tangent[g, w])
     model.pos0[g, w] = p
     model.mat0[g, w] = R
     model.slack[g, w] = real(0.0)
@@ -343,11 +341,14 @@ def read_outputs(
     st: Worlds,
     wrench: wp.array3d(dtype=real),
     fraction: wp.array(dtype=real),
+    path: wp.array(dtype=real),
     # Out:
     pressure_out: wp.array(dtype=real),
     wrench_out: wp.array2d(dtype=vec6),
+    tangent_out: wp.array2d(dtype=mat66),
 ):
-    """Pressure, and of the wrench on each group the fraction that this skin answers for."""
+    """Pressure; of the wrench and tangent of each group the fraction that this skin answers for, and how far
+    what it meets goes with the group."""
     w = wp.tid()
     if has_liquid == 1:
         pressure_out[w] = st.pressure[w] - rest_pressure[w]
@@ -356,6 +357,8 @@ def read_outputs(
         for i in range(6):
             v[i] = fraction[g] * wrench[g, w, i]
         wrench_out[g, w] = v
+        if path[g] != real(1.0):
+            tangent_out[g, w] = fraction[g] * path[g] * tangent_out[g, w]
 
 
 @wp.kernel

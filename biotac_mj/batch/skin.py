@@ -52,12 +52,10 @@ class BatchSkin:
       rest: `rest.Rest`, which skins sleep, and which come to rest instead of being solved.
       x: (nvert, nworld) nodes [m].
       motion: (ngeom, nworld) of the geoms in the last step [m].
-      fraction, path: (ngroup,) of what it does to each group that this skin answers for, and how far what it
-        meets goes with one, see `Touching`.
+      fraction: (ngroup,) of what it does to each group that this skin answers for, see `Touching`.
       wrench: (ngroup, nworld) spatial_vectord of the skin ON each touching body about the BioTac frame's
         origin [N, N m].
-      tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d (translation, rotation vector) without fraction
-        and path.
+      tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d (translation, rotation vector).
       pressure: (nworld,) of the liquid above the model's rest [Pa]. error: (nworld,) of the last step in the
         energy norm, estimated.
       bodies: `skin.bodies.Bodies`, of skins with tangents: how what touches gives way, for the caller to
@@ -115,7 +113,7 @@ class BatchSkin:
             self.tier = (self._condensed or self.data.worlds).tier
             self.slack = self._condensed.slack if self._condensed else wp.zeros((0, nworld), dtype=wp.float64)
             allocate("batch", self, {"group": self.ngroup, "world": nworld})
-            self.fraction, self.path = (
+            self.fraction, self._path = (
                 wp.array(a, dtype=wp.float64) for a in (touching.fraction, touching.path)
             )
             self.by_mocap = wp.array(touching.by_mocap, dtype=bool)
@@ -195,15 +193,11 @@ class BatchSkin:
         wanted = self._tangents and self.ngroup
         if self._condensed:
             self._condensed.end(self.tangent if wanted else None)
-        self._launch(
-            kernels.read_outputs,
-            self.nworld,
-            [d.rest_pressure, int(m.has_liquid), d.worlds, self._wrench, self.fraction],
-            [self.pressure, self.wrench],
-        )
-        if wanted:
-            if not self._condensed:
-                d.preconditioner.measure_tangents(Launcher(m.device), self.geoms, d.x, self.tangent)
+        elif wanted:
+            d.preconditioner.measure_tangents(Launcher(m.device), self.geoms, d.x, self.tangent)
+        known = [d.rest_pressure, int(m.has_liquid), d.worlds, self._wrench, self.fraction, self._path]
+        found = [self.pressure, self.wrench, self.tangent]
+        self._launch(kernels.read_outputs, self.nworld, known, found)
         self.rest.end_solve()
 
     def prepare_keep(self) -> None:

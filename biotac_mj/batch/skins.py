@@ -161,8 +161,7 @@ class Skins:
         skin, st = self.skin, self.skin.data.worlds
         self.rest.come_to_rest()
         where = [pos, mat, skin.geoms.struct]
-        solved = [st, self.began, skin.wrench, skin.tangent, skin.slack]
-        solved += [skin.fraction, skin.path, self.rest.resets]
+        solved = [st, self.began, skin.wrench, skin.tangent, skin.slack, self.rest.resets]
         self._launch(kernels.accept_models, self.groups, [*solved, *where, self._last], [self.model])
 
     def place_geoms(self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array) -> None:
