@@ -323,7 +323,6 @@ class SkinStep:
         self._precondition()
         compliant.find_pending(self._launcher)
         self._solve()
-        self._launcher.loop(self._solve_on, self._continue_solve)
         self._take_full_step()
         compliant.end_pending(self._launcher)
 
@@ -427,7 +426,6 @@ class SkinStep:
 
     def _iterate(self):
         self._solve()
-        self._launcher.loop(self._solve_on, self._continue_solve)
         self._search()
         self._launcher.loop(self._search_on, self._continue_search)
         self.M.renew_if_due(self._launcher, self.d.x)
@@ -460,15 +458,9 @@ class SkinStep:
         self.M.update(self._launcher, residual, k.p, k.partial, self._forces.in_parallel)
 
     def _solve(self):
-        self._launch(krylov.begin_solve, self.d.nworld, [self.st, self._solve_on])
+        self._launch(krylov.begin_solve, self.d.nworld, [self.st])
         self._advance_solve(1)
-
-    def _continue_solve(self):
-        k, st = self.k, self.st
-        self.put_inverse(self._launcher)
-        self._decide(krylov.choose_beta, [k.partial, st])
-        self._launch(self._krylov_kernels.next_direction, self.d.x.shape, [k.z, st, k.p])
-        self._advance_solve(0)
+        self._launcher.loop(self._solve_on, lambda: self._advance_solve(0))
 
     def _advance_solve(self, first):
         """One iteration of conjugate gradients along p."""
@@ -479,9 +471,12 @@ class SkinStep:
         chunks, gradient = (k.nchunk, d.nworld), self._forces.gradient
         inputs = [k.chunk, k.p, k.q, k.viscous_work, gradient, m.wet_node, st.running]
         self._launch(kernels.measure_product, chunks, inputs, [k.partial, self._solve_on])
-        self._decide(krylov.choose_alpha, [m.options.max_cg, k.partial, st], [self._solve_on])
+        self._decide(krylov.choose_alpha, [m.options.max_cg, k.partial, st])
         inputs = [k.chunk, first, k.p, k.q, gradient, m.wet_node, st, k.dx, k.r]
         self._launch(kernels.update_solution, chunks, inputs, [k.partial])
+        self.put_inverse(self._launcher)
+        self._decide(krylov.choose_beta, [k.partial, st], [self._solve_on])
+        self._launch(kernels.next_direction, d.x.shape, [k.z, st, k.p], [k.dx])
 
     def _search(self):
         self._take_full_step()
@@ -555,7 +550,6 @@ class SkinStep:
         self._forces.evaluate(self._launcher, self.st.active)
         self._check()
         self._solve()
-        self._continue_solve()
         self._search()
         self._continue_search()
         self._end_try()

@@ -51,9 +51,9 @@ def check_convergence(
     """Convergence test of each active world: in the energy norm, and of the pressure above rest, which the
     sensor reads. partial: residual . z and gradient . z; norms: see `nodes.residuals`.
 
-    If only the pressure is above its tolerance, by at most a factor of `_CORRECTED`, the world converges with
-    the pressure that z predicts. In a stiff liquid the nodes move by picometres for it, see
-    `nodes.correct_pressure`.
+    A world converges with the pressure that z predicts, which balances the forces better, also where this
+    alone is above its tolerance, by at most a factor of `_CORRECTED`. In a stiff liquid the nodes move by
+    picometres for it, see `nodes.correct_pressure`.
 
     passing: tolerance of load increments within the path."""
     w, t = wp.tid()
@@ -135,14 +135,16 @@ def check_convergence(
     settled = wp.where(viscosity == real(0.0) or increment > real(0.0), 1, 0)
     corrects = int(0)
     if needs_pressure == 1:
+        stiff = compliance_ratio <= _STIFF_LIQUID
         pushes = stiffer * kappa * wp.abs(gz)
         allowed_off = _PRESSURE_TOLERANCE * wp.abs(pressure) + _PRESSURE_NOISE
-        if pushes > allowed_off:
-            stiff = compliance_ratio <= _STIFF_LIQUID
-            if viscosity == real(0.0) and pushes <= _CORRECTED * allowed_off and stiff:
-                corrects = 1
-            else:
-                settled = 0
+        off_by = wp.where(pushes > allowed_off, 1, 0)
+        if viscosity == real(0.0) and pushes <= _CORRECTED * allowed_off and stiff:
+            corrects = wp.where(
+                iterations > start_iterations, 1, off_by
+            )  # where nothing moves, nothing changes
+        elif off_by == 1:
+            settled = 0
     # an error that did not halve in more iterations than are left will not do so in these
     patience = wp.min(_PATIENCE, limit - iterations)
     # rz may be negative where rounding makes the preconditioner indefinite: its size is the error

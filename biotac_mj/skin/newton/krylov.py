@@ -12,7 +12,7 @@ from ..contact.faces import block_index
 from ..types import Precision, real, vec3
 from .line_search import begin_line_search
 from .nodes import LiquidForces, NodeSlots, SurfaceForces
-from .worlds import Worlds, total_of, totals_of
+from .worlds import Worlds, totals_of
 
 kernel_module(__name__)
 
@@ -29,11 +29,9 @@ class Inertia:
 
 
 @wp.kernel
-def begin_solve(st: Worlds, any_active: wp.array(dtype=int)):
+def begin_solve(st: Worlds):
     """Starts the linear solve of world w, unless it has converged."""
     w = wp.tid()
-    if w == 0:
-        any_active[0] = 0
     st.running[w] = st.active[w]
     st.moving[w] = st.active[w]
     st.iterations_cg[w] = 0
@@ -42,7 +40,7 @@ def begin_solve(st: Worlds, any_active: wp.array(dtype=int)):
 
 
 @wp.kernel
-def choose_alpha(limit: int, partial: wp.array3d(dtype=real), st: Worlds, any_active: wp.array(dtype=int)):
+def choose_alpha(limit: int, partial: wp.array3d(dtype=real), st: Worlds):
     """Step length of conjugate gradients in world w. partial: p . q, gradient . p, viscous work."""
     w, t = wp.tid()
     if st.running[w] == 0:
@@ -83,29 +81,41 @@ def choose_alpha(limit: int, partial: wp.array3d(dtype=real), st: Worlds, any_ac
     st.alpha[w] = alpha
     st.predicted_pressure[w] = st.predicted_pressure[w] - alpha * st.pressure_response[w]
     st.viscous_work[w] = before + wp.max(alpha * alpha * viscous_work, real(0.0))
-    # a step length near one: the preconditioner is as accurate as the tangent
-    if wp.abs(alpha - real(1.0)) <= real(0.2) or iterations + 1 >= limit:
+    if iterations + 1 >= limit:
         st.running[w] = 0
-    else:
-        any_active[0] = 1
 
 
 @wp.kernel
-def choose_beta(partial: wp.array3d(dtype=real), st: Worlds):
-    """Ends the linear solve of world w if it has reduced r . z to a hundredth. partial: r . z."""
+def choose_beta(partial: wp.array3d(dtype=real), st: Worlds, any_active: wp.array(dtype=int)):
+    """Ends the linear solve of world w if it has reduced r . z to a hundredth, or along the next direction,
+    without a product there. partial: r . z, gradient . z."""
     w, t = wp.tid()
     if st.running[w] == 0:
+        if t == 0:
+            st.beta[w] = real(0.0)
         return
     first = st.start_rz[w]
     before = st.rz[w]
-    rz = total_of(partial, 0, w, t)
+    alpha = st.alpha[w]
+    change = alpha * st.kappa[w]
+    response = alpha * st.pressure_response[w]
+    predicted = st.predicted_pressure[w]
+    total = totals_of(partial, w, t)
     if t > 0:
         return
-    if not (rz > real(0.01) * wp.abs(first)):
-        st.running[w] = 0
-        return
-    st.beta[w] = rz / before
+    rz = total[0]
+    beta = rz / before
     st.rz[w] = rz
+    if wp.abs(alpha - real(1.0)) <= real(0.2) and beta > real(0.0) and beta < real(1.0):
+        # a step length near one: the preconditioner is as accurate as the tangent, for the next direction too
+        st.running[w] = 0
+        st.predicted_pressure[w] = predicted - change * total[1] - beta * response
+    elif rz > real(0.01) * wp.abs(first):
+        any_active[0] = 1
+    else:
+        st.running[w] = 0
+        beta = real(0.0)
+    st.beta[w] = beta
 
 
 @functools.cache
@@ -270,11 +280,16 @@ def _update_kernels(precision):
         partial_out[0, c, w] = rr
 
     @wp.kernel(module=module)
-    def next_direction(z: wp.array2d(dtype=vec), st: Worlds, p: wp.array2d(dtype=vec)):
-        """p = z + beta p at node i."""
+    def next_direction(
+        z: wp.array2d(dtype=vec), st: Worlds, p: wp.array2d(dtype=vec), dx: wp.array2d(dtype=vec)
+    ):
+        """p = z + beta p at node i, or the last motion along it, of the length of the one before."""
         i, w = wp.tid()
+        beta = scalar(st.beta[w])
         if st.running[w] == 1:
-            p[i, w] = z[i, w] + scalar(st.beta[w]) * p[i, w]
+            p[i, w] = z[i, w] + beta * p[i, w]
+        elif beta > scalar(0.0):
+            dx[i, w] = dx[i, w] + scalar(st.alpha[w]) * (z[i, w] + beta * p[i, w])
 
     return {"update_solution": update_solution, "next_direction": next_direction}
 
