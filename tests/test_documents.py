@@ -147,7 +147,7 @@ def test_every_block_runs_or_is_named():
     """A block has a language that says what becomes of it, and what is left out is there."""
     for page in PAGES:
         kinds = set(re.findall(r"^ *```([^\n`]+)$", page.read_text(), re.M))
-        assert kinds <= {"sh", "python", "py", "text", "yaml", "bibtex", "{toctree}"}, (page.name, kinds)
+        assert kinds <= {"sh", "python", "py", "text", "yaml", "bibtex"}, (page.name, kinds)
         if page.parent.name != "lab":  # what measures for hours stands there, and is understood
             assert not re.search(r"\n\n    \S", FENCE.sub("", page.read_text())), f"{page.name}: use a fence"
     found = [(page.name, text) for page in PAGES for _, _, text, _ in blocks(page.read_text())]

@@ -1,7 +1,9 @@
 """The documentation: every page is in the menu, every link and picture is there, the site builds."""
 
 import os
+import pathlib
 import re
+import runpy
 import subprocess
 import sys
 
@@ -9,6 +11,7 @@ import api
 import browser
 import pytest
 
+_MENU = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "docs" / "conf.py"))["menu"]
 _FENCE = re.compile(r"^(`{3,}|:{3,}).*?^\1\s*$", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 
@@ -18,13 +21,10 @@ def pages(repo):
 
 
 def in_menu(page):
-    """Pages that the toctrees of a page name."""
-    text = page.read_text()
-    for tree in re.findall(r"^```\{toctree\}\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
-        for name in tree.splitlines():
-            if name.strip() and not name.startswith(":"):
-                name = re.sub(r".*<(.*)>", r"\1", name.strip())
-                yield (page.parent / f"{name}.md").resolve()
+    """Pages in the menu that a page makes."""
+    if page.name == "index.md":
+        for names in _MENU(page.read_text()).values():
+            yield from ((page.parent / f"{name}.md").resolve() for name in names)
 
 
 def links(text):
@@ -63,11 +63,11 @@ def test_every_page_is_in_the_menu(repo):
     found, more = set(), {(repo / "docs" / "index.md").resolve()}
     while more:
         page = more.pop()
-        assert page.is_file(), f"a toctree names {page.relative_to(repo)}, which is not there"
+        assert page.is_file(), f"a menu names {page.relative_to(repo)}, which is not there"
         found.add(page)
         more |= set(in_menu(page)) - found
     lost = {p.resolve() for p in pages(repo)} - found
-    assert not lost, f"in no toctree: {', '.join(str(p.relative_to(repo)) for p in sorted(lost))}"
+    assert not lost, f"in no menu: {', '.join(str(p.relative_to(repo)) for p in sorted(lost))}"
 
 
 def test_no_link_is_broken(repo):
@@ -95,14 +95,9 @@ def test_the_api_page_has_todays_docstrings(repo):
 
 
 def test_pages_read_as_plain_markdown(repo):
-    """No directive but the menu: what shows code or a picture on the site shows it on a Git host too."""
-    found = {
-        str(page.relative_to(repo)): sorted(
-            set(re.findall(r"^(?:```|:::)\{(\w[\w-]*)\}", page.read_text(), re.M))
-        )
-        for page in pages(repo)
-    }
-    assert all(set(names) <= {"toctree"} for names in found.values()), found
+    """No directive: what shows code or a picture on the site shows it on a Git host too."""
+    for page in pages(repo):
+        assert not re.findall(r"^(?:```|:::)\{(\w[\w-]*)\}", page.read_text(), re.M), page
     assert len((repo / "docs" / "validation.md").read_text().split()) <= 1500
 
 
