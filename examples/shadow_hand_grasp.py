@@ -348,7 +348,7 @@ def run(name, height=0.08, tier="condensed", skin="coarse", frame=None, progress
 
 def camera():
     out = mujoco.MjvCamera()
-    out.lookat[:], out.distance, out.azimuth, out.elevation = [0.0, 0, 0.115], 0.31, 152, -14
+    out.lookat[:], out.distance, out.azimuth, out.elevation = [0.0, 0, 0.15], 0.4, 152, -14
     return out
 
 
