@@ -364,6 +364,24 @@ def test_led_friction_does_not_know_the_push():
     assert forces[LAGGED][0] == pytest.approx(-mu * forces[RECORDED][2], rel=1e-3)
 
 
+def test_friction_of_a_lagged_bound_does_not_end_with_the_push():
+    """Where a sample leaves the geom, else the forces would have no potential, in which a solve with held
+    bounds descends."""
+    h, mu = 4e-3, 0.1
+    model, geoms = pad(nu=0.3, law="corotational"), GeomSet(["plane"], [()], friction=[mu])
+    data = SkinData(model)
+    for k in range(3):
+        plane_at(geoms, 5e-3 + 2e-4 * k, h - 1e-4 * k)
+        step(model, data, geoms)
+    x, forces = data.vert_xpos[0], []
+    for mode, z in ((RECORDED, h - 2e-4), (LAGGED, h)):
+        data.worlds.friction_mode.fill_(mode)
+        plane_at(geoms, 6e-3, z)
+        forces.append(evaluate(model, data, geoms, x)[0].sum(0))
+    assert forces[0][2] < -0.1 and forces[1][2] == 0.0
+    assert forces[1][0] == pytest.approx(-mu * forces[0][2], rel=1e-3)
+
+
 def test_contact_tangent_where_slip_is_a_power_of_the_push():
     """Of friction that falls with the load, coupled to the push: a plane goes straight down, so that the
     pressure of the nodes rises as that of the samples."""

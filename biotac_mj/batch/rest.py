@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from ..coupling.implicit.rounds import MarkedWorlds, Marks, Model, mark
-from ..coupling.implicit.rules import PATIENCE, stayed
+from ..coupling.implicit.rules import PATIENCE
 from ..kernels import add_zeros, kernel_module
 from ..skin.contact.broadphase import contact_range
 from ..skin.contact.faces import Laws
@@ -26,7 +26,6 @@ from .clearance import Clearance, Seen, forget, make_seen, margin_of
 kernel_module(__name__)
 
 _PATIENCE = wp.constant(PATIENCE)
-_stayed = wp.func(stayed)
 # what is known of a geom near a skin whose solve begins
 AFAR, NEAR, TOUCHING = (wp.constant(i) for i in range(3))
 
@@ -41,7 +40,7 @@ class Sleep:
     at_rest: wp.array(dtype=int)  # came to rest by the last solve
     undeformed: wp.array(dtype=int)  # and has stayed so
     resting: wp.array(dtype=int)  # sleeps
-    stays: wp.array(dtype=int)  # steps in a row in which it has stayed where it was
+    unsettled: wp.array(dtype=int)  # steps in a row that did not settle
     own: wp.array(dtype=vec4)  # constants as it was made, and as it fell asleep
     constants: wp.array(dtype=vec4)
     seen: Seen
@@ -190,7 +189,7 @@ def give_up(
         if s.near[w] != TOUCHING:
             gone[w] = True
             st.nonconverged[w] = st.nonconverged[w] - 1
-        elif st.load_factor[w] == real(0.0) and s.stays[w] >= _PATIENCE:
+        elif st.load_factor[w] == real(0.0) and s.unsettled[w] >= _PATIENCE:
             anew = True
     if st.wanted[w] == 1:
         s.at_rest[w] = wp.where(gone[w], 1, 0)
@@ -259,15 +258,17 @@ def end_step(
     wrench_out: wp.array2d(dtype=vec6),
     tangent_out: wp.array2d(dtype=mat66),
 ):
-    """Counts the steps that reached no equilibrium, of skin or of skin and bodies, and consecutive ones in
-    which the skin did not move; puts untouched skins in equilibrium to sleep. A released one with a geom
+    """Counts the steps that reached no equilibrium, of skin or of skin and bodies, and those in a
+    row; puts untouched skins in equilibrium to sleep. A released one with a geom
     nearby stays awake: when the geom leaves, it comes to rest. Those that slept touch nothing, whatever the
     solves of other worlds wrote."""
     w = wp.tid()
     if st.reason[w] != NOT_FINITE:
         began[w] = 1
-        s.stays[w] = _stayed(s.stays[w], st.load_factor[w])
-        if st.reason[w] != CONVERGED or settled[w] == 0:
+        if st.reason[w] == CONVERGED and settled[w] == 1:
+            s.unsettled[w] = 0
+        else:
+            s.unsettled[w] += 1
             failed[w] += 1
     if s.awake[w] == 0:
         _push_nothing(w, touched_by_out, wrench_out, tangent_out)
@@ -309,7 +310,7 @@ class Rest:
       any: (1,) wp.array int, 1 where any does.
       gone: (nworld,) wp.array bool, which skins come to rest by this solve; resets: those, and those that
         begin anew.
-      stays: (nworld,) wp.array int, steps in a row in which the skin has stayed where it was.
+      unsettled: (nworld,) wp.array int, steps in a row that did not settle.
       clearance: `Clearance` from the skins at rest.
       lasting: the arrays [world] that outlive a step, besides those that are declared in `skin.state`.
     """
@@ -324,7 +325,7 @@ class Rest:
             self._any_reset, self._sleep, st = wp.zeros(1, dtype=int), Sleep(), data.worlds
             s = self._sleep
             add_zeros(s, "woken near at_rest undeformed resting", n)
-            s.awake, s.stays, s.seen = self.awake, self.stays, make_seen(skin.geoms.count, n)
+            s.awake, s.unsettled, s.seen = self.awake, self.unsettled, make_seen(skin.geoms.count, n)
             made = np.stack([a.numpy() for a in (st.mu, st.lam, st.kappa, st.natural)], axis=1)
             s.own, s.constants = (wp.array(made, dtype=vec4) for _ in range(2))
         self._from_asleep, self.clearance = Clearance(model, n, s.seen), Clearance(model, n)

@@ -17,7 +17,7 @@ from ..skin.bodies import BodyMotion
 from .config import TIERS
 from .implicit.kinematics import Kinematics
 from .implicit.metric import assign_slots
-from .implicit.rules import EULER, PATIENCE, stayed
+from .implicit.rules import EULER, PATIENCE
 from .loads import Touches
 from .setup import (
     CONVERGED,
@@ -486,11 +486,10 @@ class Instance:
         readings, _ = self._counts()
         head, models, skin, readings_state = self.parts
         good = self._sum_up(self._settled)
-        steps = stayed(max(-head[CONVERGED], 0.0), float(result.load_factor))
         reach = OUT_OF_REACH if self.outcome.acting is None else REACHED
         if good and self.stays:
             reach = STAYED if result.measured else -STAYED
-        head[:] = head[FAILED] + (not good), good - steps, reach
+        head[:] = head[FAILED] + (not good), 1.0 if good else min(head[CONVERGED], 0.0) - 1.0, reach
         for name, value in zip(LINEAR, result.model):
             models[name] = value
         models["end_pos"], models["end_mat"] = self.ends or result.pose

@@ -16,9 +16,8 @@ from .stepper import SkinResult, make_readings, make_stepper
 from .structs import ModelView
 from .touching import Touching, forget_notes
 
-# head of the plugin state: steps that did not converge; whether the last committed step did, or less the
-# steps in which the skin has stayed where it was; whether a step was made since the reset, and what was in
-# reach of the skin in it
+# head of the plugin state: steps that did not settle; 1 if the last committed step did, or less the steps in
+# a row that did not; whether a step was made since the reset, and what was in reach of the skin in it
 _HEAD = 3
 FAILED, CONVERGED, STARTED = range(_HEAD)
 # STAYED: the last solve left the skin as it was; negative where its error is not measured

@@ -179,7 +179,7 @@ VARIABLES = (
     # of `batch.skin.BatchSkin`: 1: no step was made since the reset; number of steps without motion of the
     # skin; results of the last step
     Variable("fresh", "batch.fresh", (), int, 1, MEMORY, saved=(), needs=("implicit",), **_OF_STEPS),
-    Variable("stays", "rest.stays", (), int, 0, MEMORY, saved=(), **_OF_STEPS),
+    Variable("unsettled", "rest.unsettled", (), int, 0, MEMORY, saved=(), **_OF_STEPS),
     Variable("batch_pressure", "batch.pressure", (), real, 0.0, OUTCOME),
     Variable("batch_wrench", "batch.wrench", ("group",), wp.spatial_vectord, 0.0, OUTCOME, **_OF_STEPS),
     Variable("batch_tangent", "batch.tangent", ("group",), wp.spatial_matrixd, 0.0, OUTCOME, **_OF_STEPS),

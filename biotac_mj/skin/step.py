@@ -349,7 +349,8 @@ class SkinStep:
         """The next try of the open worlds."""
         d, k, st, m, g = self.d, self.k, self.st, self.m, self.geoms
         bounds = [_LEAST_INCREMENT if g.count else 1.0, m.options.max_work]
-        self._launch(load_path.choose_increment, d.nworld, [*bounds, st, self._any_open, self._any_increment])
+        inputs = [*bounds, int(self._compliant is not None), st, self._any_open, self._any_increment]
+        self._launch(load_path.choose_increment, d.nworld, inputs)
         # slip of new contact counts from the poses at the end of an accepted increment
         poses = [(g.struct.pos, g.struct.pos_last), (g.struct.mat, g.struct.mat_last)]
         for value, out in [*poses, (d.x, k.x_start)]:

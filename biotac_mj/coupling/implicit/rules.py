@@ -14,7 +14,7 @@ STILL, FORETOLD = 2e-9, 1e-6
 # [m] a body that was moved further than this, and than it goes by itself in a step, was put there
 TELEPORT = 1e-3
 MAX_CORRECTIONS = 12  # of what the integrator's accelerations differ in from the constraint solver's
-PATIENCE = 3  # steps in which a skin may stay where it was, after which it begins anew from rest
+PATIENCE = 3  # unsettled steps in a row after which a skin that does not move begins anew from rest
 EULER = 1.5  # gamma of backward Euler's member of the family of steps
 LOSS_FREQUENCY = 50.0  # [Hz] at which the rubber has its loss factor
 _UNKNOWN = math.inf  # [J] of energy
@@ -89,11 +89,3 @@ def poorly_corrected(wrong: Any, excess: Any, wrench: Any, tolerance: Any) -> An
     is to be corrected of wrenches `wrench`, all largest entries [N]. Not where the simulation has blown up:
     nothing is greater than nan."""
     return wrong > tolerance * max(excess, wrench)
-
-
-def stayed(before: Any, reached: Any) -> Any:
-    """Steps in a row in which a skin has stayed where it was, after one that went a fraction `reached` of its
-    way; before: of the steps before it."""
-    if reached > type(reached)(0.0):
-        return type(before)(0)
-    return before + type(before)(1)

@@ -36,7 +36,7 @@ CORE, SOLIDS, MESHES, SKINS = "core", "solids", "meshes", "skins"
 BLOCK = 256  # threads of a block of `by_sample`, and the most samples of a face
 # Friction modes: the bound is mu times the current normal force, with a symmetric tangent (CURRENT) or with
 # the exact one (CONSISTENT); it is stored as well (RECORDED); it is the stored one of an earlier equilibrium
-# (LAGGED)
+# (LAGGED), and acts also where the sample leaves the geom, so that the forces have a potential
 CURRENT, CONSISTENT, RECORDED, LAGGED = (wp.constant(i) for i in range(4))
 _LEAST_PRESSURE = 1e-2  # over friction_pressure: below it the coefficient is constant
 
@@ -254,10 +254,9 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
         friction_mode: int,
         near: wp.int64,
     ):
-        """Contact of the samples begin to end - 1 of face f with a set of geoms.
-
-        Returns whether they touch, their least clearance [m], and of the last one force [N], tangent [N/m]
-        and barycentric coordinates at which the force acts. On the CPU they are added to the face's sums."""
+        """Contact of the samples begin to end - 1 of face f with a set of geoms: whether they touch, their
+        least clearance [m], and of the last one force [N], tangent [N/m] and barycentric coordinates at which
+        the force acts. On the CPU they are added to the face's sums."""
         t = c.face[f]
         x0 = x[t[0], w]
         x1 = x[t[1], w]
@@ -276,13 +275,16 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
             k = c.stiffness[w] * area
             p = b[0] * x0 + b[1] * x1 + b[2] * x2
             touched = int(-1)
-            gap = real(0.0)
+            reach = real(0.0)
             if wp.static(has_law):
-                gap = c.laws.reach[w]
+                reach = c.laws.reach[w]
             width = real(0.0)
             if wp.static(smooth):
                 width = c.laws.smoothing[w]
-                gap = width
+                reach = width
+            gap = reach
+            if friction_mode == LAGGED and c.bound.shape[0] > i:
+                gap = wp.where(c.bound[i, w] > real(0.0), real(wp.inf), reach)
             normal = vec3()
             local = vec3()
             at = b
@@ -340,10 +342,12 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
                 else:
                     K = k * wp.outer(normal, normal)
                 if wp.static(smooth):
-                    if width > real(0.0):
-                        push = smooth_traction(k, width, gap)
-                        fn = push[0]
-                        K = push[1] * wp.outer(normal, normal)
+                    push = smooth_traction(k, width, gap)
+                    fn = push[0]
+                    K = push[1] * wp.outer(normal, normal)
+                if gap >= reach:
+                    fn = real(0.0)
+                    K = mat33()
                 # K leaves out how a smooth surface turns the normal: with it the tangent is not definite, and
                 # Newton's method finds equilibria that are not stable
                 force = fn * normal
@@ -352,8 +356,7 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
                 if mu > real(0.0) and (fn > real(0.0) or friction_mode == LAGGED):
                     if c.anchor_geom[i, w] == touched:
                         stick = c.anchor[i, w]
-                    else:
-                        # new contact: slip counts from where the sample was on the geom when the step began
+                    else:  # new contact: slip counts from where it was on the geom when the step began
                         last = b[0] * c.x_last[t[0], w] + b[1] * c.x_last[t[1], w] + b[2] * c.x_last[t[2], w]
                         stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
                     if wp.static(shapes == SKINS):
@@ -364,16 +367,13 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
                     start = stick
                     ft, Kt, stick = slide(local, start, normal, most, k * c.stick_ratio, width)
                     force = force + ft
-                    if friction_mode == CONSISTENT and width == real(0.0):
-                        if wp.length_sq(stick - start) > real(0.0):  # it slips
-                            Kt = Kt + slope_factor * mu / most * wp.outer(ft, K * normal)
+                    slips = wp.length_sq(stick - start) > real(0.0)
+                    if friction_mode == CONSISTENT and width == real(0.0) and slips:
+                        Kt = Kt + slope_factor * mu / most * wp.outer(ft, K * normal)
                     K = K + Kt
                 R = geoms.mat[touched, w]
                 force = R * force
                 K = R * K * wp.transpose(R)
-            c.trial_geom[i, w] = touched
-            c.bond[i, w] = bond
-            if touched >= 0:
                 c.trial_anchor[i, w] = stick
                 c.sample_force[i, w] = force
                 if one_thread() == 1:
@@ -382,6 +382,8 @@ def _samples_function(has_law: bool, smooth: bool, shapes: str) -> wp.Function:
                         f, w, first, clearance, force, K, at, nsample, c.corner, c.block, block_memory()
                     )
                 touching = 1
+            c.trial_geom[i, w] = touched
+            c.bond[i, w] = bond
         return touching, clearance, force, K, at
 
     return touch_samples

@@ -118,7 +118,7 @@ def check_convergence(
     enough = tolerance
     if st.trial_factor[w] < real(1.0):
         enough = passing
-    elif st.error[w] < st.least_error[w] and st.inverted[w] < 2:
+    elif st.error[w] < st.least_error[w] and st.inverted[w] < 2 and iterations > start_iterations:
         st.least_error[w] = st.error[w]
         st.improved[w] = 1
     needs_pressure = has_liquid

@@ -68,6 +68,7 @@ def _bounds_converge(st: Worlds, w: int):
 def choose_increment(
     shortest: real,
     max_work: int,
+    keeps_iterate: int,
     st: Worlds,
     any_open: wp.array(dtype=int),
     any_increment: wp.array(dtype=int),
@@ -76,13 +77,15 @@ def choose_increment(
     continue are moving.
 
     The first try takes the whole load path. Increments start short, since together they cost little more than
-    the whole path, and converged ones are kept. Anchors are committed at the end of each increment.
+    the whole path, and converged ones are kept. Anchors are committed at the end of each increment. Where
+    a try of the whole path is not lost (keeps_iterate), the second one takes it, too, with the bounds below.
 
     Where friction is several times the normal force, Newton's method cycles, since the normal force bounds
     the slip and depends on it. After a failed increment, and always for load-dependent friction, the bound is
     therefore lagged: it is computed from the normal forces of the last equilibrium. With fixed bounds the
-    forces have a potential (except adhesion). The bounds are updated until they repeat. If they do not, the
-    anchors are committed at each equilibrium; slip then dissipates energy, so that the iteration ends.
+    forces have a potential (except adhesion), also if samples leave the geom. The bounds are updated until
+    they repeat. If they do not, the anchors are committed at each equilibrium; slip then dissipates energy,
+    so that the iteration ends.
 
     any_open: the flag of `end_try`, which is cleared.
     """
@@ -124,10 +127,13 @@ def choose_increment(
         increment = _FIRST_INCREMENT
         if st.deep[w] == 1:
             st.reason[w] = INSIDE_CORE
+        elif keeps_iterate == 1:
+            increment = real(1.0)
+            st.cut_back[w] = LAST_CUT_BACK
         if st.guessed[w] == 1:
             increment = real(0.0)
     else:
-        increment = real(0.5) * increment
+        increment = wp.min(real(0.5) * increment, _FIRST_INCREMENT)
         st.cut_back[w] = LAST_CUT_BACK
     if increment < shortest or max_work - st.work[w] < max_work / 10:
         st.unfinished[w] = 0
