@@ -2,9 +2,11 @@
 
     python benchmarks/discrepancy_confidence.py out/first.json out/second.json
     python benchmarks/discrepancy_confidence.py out/first.json out/second.json --left-out
+    python benchmarks/discrepancy_confidence.py out/checkup.json --checkup
 
 JSON are files of `discrepancy_recordings.py`. The weights go into
 `biotac_mj/discrepancy/recordings/confidence.json`; those of faults of the log stay in `quality.confidence`.
+--checkup prints what stands there of what a checkup alone finds, by files of `checkup_labs.py`.
 --parts: only these of them, detectors or kinds of recordings.
 --left-out writes nothing: the table of each author's pieces, named by weights that are fitted to the other
 authors' alone.
@@ -19,7 +21,7 @@ from discrepancy_recordings import table
 from records import read_json, write_json
 
 from biotac_mj.discrepancy.recordings.confidence import NAMED, farthest
-from biotac_mj.quality.confidence import PER_CANDIDATE, WEIGHTS, probability
+from biotac_mj.quality.confidence import NEW, PER_CANDIDATE, WEIGHTS, decades, probability
 
 __all__ = ["authors_left_out", "fit"]
 
@@ -37,6 +39,7 @@ FEATURES = {
     "late": {"gain": 1, "size": 1},
     "lag": {"explained": 1},
 }
+CHECKUP = {"gone": {}, "loud": {"decades": 1}, "memory": {"decades": 1}}
 _ROWS = ("rhythm", "sharp", "sharp1")
 # of what is left: each may be what no name fits. Under a load levels are in recordings without an effect what
 # they are in others
@@ -64,6 +67,23 @@ def fit(rows: list) -> dict:
         name: _logistic([c for c in cases if c["detector"] == name], FEATURES[name]) for name in FEATURES
     }
     return {"weights": {name: w for name, w in weights.items() if w}, "usual": usual}
+
+
+def of_checkups(rows: list) -> dict:
+    """(intercept, features) of `quality.confidence` for what a checkup alone finds, and how many names of it
+    are right, of how many."""
+    names = [n | {"beside": 0, "features": {"decades": decades(n["p"])}} for r in rows for n in r["named"]]
+    out = {}
+    for detector, features in CHECKUP.items():
+        mine = [n for n in names if n["detector"] == detector]
+        if fitted := _logistic(mine, features):
+            weights = {
+                k: (round(w / NEW, 3), *np.round(ends, 1).tolist())
+                for k, (w, *ends) in fitted["features"].items()
+            }
+            right = sum(n["right"] is not None for n in mine)
+            out[detector] = round(fitted["intercept"] / NEW, 3), weights, right, len(mine)
+    return out
 
 
 def _candidates(rows):
@@ -163,8 +183,15 @@ def main(argv=None):
     args.add_argument("json", nargs="+", metavar="JSON")
     args.add_argument("--parts", nargs="+", metavar="NAME")
     args.add_argument("--left-out", action="store_true")
+    args.add_argument("--checkup", action="store_true")
     options = args.parse_args(argv)
-    rows = [r for path in options.json for r in json.loads(pathlib.Path(path).read_text())["cases"]]
+    documents = [json.loads(pathlib.Path(path).read_text()) for path in options.json]
+    if options.checkup:
+        labs = [lab["checkup"] for d in documents for lab in d["labs"] if "checkup" in lab]
+        for detector, weights in of_checkups(labs).items():
+            print(detector, *weights)
+        return
+    rows = [r for d in documents for r in d["cases"]]
     rows = [r for r in rows if "refused" not in r]
     if options.left_out:
         rows = authors_left_out(rows)

@@ -11,8 +11,9 @@ from scipy.signal import lfilter
 
 from biotac_mj import cli
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
+from biotac_mj.discrepancy.recordings.candidates import Candidate
 from biotac_mj.discrepancy.recordings.detectors.memory import remembered
-from biotac_mj.discrepancy.recordings.search import _everywhere
+from biotac_mj.discrepancy.recordings.search import _beside, _everywhere
 from biotac_mj.discrepancy.recordings.segments import free_rows
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.quality.check import sample_faults
@@ -89,11 +90,6 @@ def struck(x, noise, rng):
     return x
 
 
-def one_struck(x, noise, rng):
-    x[rng.choice(np.arange(10, 3990, 10), 8, replace=False), 6] += 9 * noise[0, 6]
-    return x
-
-
 def shaking(x, noise, rng):
     x[:, 2] += 1.5 * noise[0, 2] * gaussian_filter1d(rng.standard_normal(len(x)), 3) * np.sqrt(6 * np.pi**0.5)
     return x
@@ -101,7 +97,7 @@ def shaking(x, noise, rng):
 
 @pytest.mark.parametrize(
     "change, name, channels",
-    [(struck, "spikes", range(19)), (one_struck, "spikes", (6,)), (shaking, "noise", (2,))],
+    [(struck, "spikes", range(19)), (shaking, "noise", (2,))],
 )
 def test_at_rest_what_is_more_than_noise_is_found(change, name, channels):
     """Of which the searches for any log find none: a load does as much."""
@@ -238,6 +234,13 @@ def test_taps_are_sharper_than_a_plate_without_a_fault():
     taps, slow = (Protocol((Segment(kind, 0.0, 40.0),)) for kind in ("taps", "loops"))
     assert diagnose_recording(recording, protocol=slow).significant
     assert not diagnose_recording(recording, protocol=taps).significant
+
+
+def test_one_cause_of_an_electrode_is_likelier_than_two():
+    """A drift of one that is stuck is none; beside hum, of another one, or of all electrodes it is one."""
+    some = [("drift", (3,)), ("drift", (4,)), ("stuck", (3,)), ("hum", (4,)), ("warmup", tuple(range(19)))]
+    findings = [Candidate(id=name, channels=where, start=0.0, end=1.0, message="") for name, where in some]
+    assert _beside(types.SimpleNamespace(findings=findings)) == findings[:1]
 
 
 def test_what_an_electrode_goes_beyond_elsewhere_is_no_limit():

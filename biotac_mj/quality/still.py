@@ -1,10 +1,9 @@
-"""What stands out of the noise while nothing touches a sensor: rows that all channels leave at once, samples
-of one channel, and noise that is not white. No load makes any, so they are compared with noise alone."""
+"""What stands out of the noise while nothing touches a sensor: rows that all channels leave at once, and
+noise that is not white. No load makes any, so they are compared with noise alone."""
 
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 from scipy.stats import norm, poisson
 
 from .adjacent import last_measured
@@ -13,8 +12,7 @@ from .fault import Fault
 from .log import Log
 from .noise import ROUNDING, noise_level, sound_noise
 
-_ROW, _SAMPLE = 8.0, 5.5  # times the noise: of a row over all channels, of a sample
-_FEW, _NEAR = 4, 3  # of either; rows around one of all channels that belong to it
+_ROW, _FEW = 8.0, 4  # times the noise, of a row over all channels; so many of them
 _SLOW = (4, 8)  # rows of means, whose noise is compared with that of rows
 _CALM = 4.0  # times the noise, of a sample that counts as noise
 # correlation of the noise of channels: of the mean pair, 0.001 at most in a real sensor, of any pair 0.10
@@ -33,30 +31,12 @@ def at_rest(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     if len(rows) < 20 * BLOCKS or sound.sum() < 4 or any(f.step for f in faults):
         return []
     x = last_measured(log.counts, log.masked)[rows]
-    noise = noise_level(x, least=ROUNDING)
-    off = (x[1:-1] - 0.5 * (x[2:] + x[:-2])) / noise / np.sqrt(1.5)
-    usual = [np.broadcast_to(_usual(part), part.shape) for part in np.array_split(off, BLOCKS)]
-    off, noise = off / np.concatenate(usual), noise * np.concatenate(usual)
-    comes_back = np.abs(x[2:] - x[:-2]) / noise < np.maximum(np.abs(off), _SAMPLE) / 2
+    off = (x[1:-1] - 0.5 * (x[2:] + x[:-2])) / noise_level(x, least=ROUNDING) / np.sqrt(1.5)
+    off /= np.concatenate([np.broadcast_to(_usual(part), part.shape) for part in np.array_split(off, BLOCKS)])
     off[:, ~sound] = 0.0
     common = off.sum(1) / np.sqrt(sound.sum())
     whole = _peaks(np.abs(common) / _usual(common) > _ROW, np.abs(common))
-    found = []
-    if whole.sum() >= _FEW:
-        mask = np.repeat(whole[:, None], log.channels, axis=1)
-        text = "rows leave their neighbours on all electrodes at once, by more than noise"
-        found.append(_spikes(log, rows, mask, whole, np.arange(log.channels), text))
-        comes_back &= ~maximum_filter1d(whole, 2 * _NEAR + 1)[:, None]
-    single = (np.abs(off) > _SAMPLE) & comes_back
-    for k in np.flatnonzero(single.sum(0) >= _FEW):
-        own = _peaks(single[:, k], np.abs(off[:, k]))
-        if own.sum() >= _FEW:
-            mask = np.zeros_like(single)
-            mask[:, k] = own
-            text = f"samples of {log.name([k])} leave their neighbours by more than noise"
-            found.append(_spikes(log, rows, mask, own, [k], text))
-            sound[k] = False
-    return found + _coloured(log, x, sound)
+    return ([_spikes(log, rows, whole)] if whole.sum() >= _FEW else []) + _coloured(log, x, sound)
 
 
 def between_rests(log: Log, rests: Sequence[slice], faults: Sequence[Fault] = ()) -> list[Fault]:
@@ -151,25 +131,25 @@ def _peaks(some, size):
     return some & (size >= padded[:-2]) & (size >= padded[2:])
 
 
-def _spikes(log, rows, mask, at, channels, text):
-    """Fault of samples mask (n - 2, c) of rows (n,), at (n - 2,) bool."""
-    whole = np.zeros(log.counts.shape, bool)
-    whole[rows[1:-1]] = mask
-    number = int(at.sum())
-    strength = np.bincount(np.flatnonzero(at) * BLOCKS // len(at), minlength=BLOCKS) * _SAMPLE**2 / 2
-    when = rows[1:-1][at] / log.rate
+def _spikes(log, rows, at):
+    """Fault of all channels in rows (n,), at (n - 2,) bool."""
+    mask = np.zeros(log.counts.shape, bool)
+    mask[rows[1:-1][at]] = True
+    strength = np.bincount(np.flatnonzero(at) * BLOCKS // len(at), minlength=BLOCKS) * _ROW**2 / 2
+    when, number = rows[1:-1][at] / log.rate, int(at.sum())
+    text = "rows leave their neighbours on all electrodes at once, by more than noise, while nothing touches"
     found = Fault(
         "spikes",
-        tuple(int(k) for k in channels),
+        tuple(range(log.channels)),
         float(when[0]),
         float(when[-1]),
-        f"{number} {text}, while nothing touches",
+        f"{number} {text}",
         {"rate": (number * log.rate / len(log) * 60, NAN, NAN)},
-        whole,
+        mask,
         detector="gone",
         **evidence(strength),
     )
-    found.p = float(poisson.sf(number - 1, 2 * norm.sf(_SAMPLE) * len(at) * log.channels))
+    found.p = float(poisson.sf(number - 1, 2 * norm.sf(_ROW) * len(at)))
     return found
 
 

@@ -171,7 +171,9 @@ def _proved(session):
     sure = discoveries([f.p for f in tested])
     # faults of the log are reported whatever else was tested
     chance = [f for f, yes in zip(session.findings, sure) if not (yes or f.of_log)]
-    contradicted = [f for f in session.findings if f.verified is False or f in chance]
+    contradicted = [
+        f for f in session.findings if f.verified is False or f in chance or f in _beside(session)
+    ]
     if contradicted:
         session = session.without(*contradicted)
         session.weak = [*contradicted, *session.weak]
@@ -213,6 +215,16 @@ def _checkup(session, protocol):
             session.weak.append(finding)
         elif not any(_explains(f, finding) for f in session.findings):
             session.accept(finding)  # the first stretch with it
+    session.take_back(*_beside(session))
+
+
+def _beside(session):
+    """Drifts of electrodes of which something else, no noise, changes what they read: one cause is likelier
+    than two."""
+    single = [f for f in session.findings if not f.of_all]
+    others = [f for f in single if not (f.kind.drifts or f.kind.in_noise or f.kind.is_noise)]
+    told = {k for f in others for k in f.channels}
+    return [f for f in single if f.kind.drifts and told.intersection(f.channels)]
 
 
 def _everywhere(finding, counts):

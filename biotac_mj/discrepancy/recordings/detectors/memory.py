@@ -88,6 +88,7 @@ def remembered(session: Session, free: np.ndarray) -> Candidate | None:
         nats=float(gain.sum()),
         p=p,
         detector="memory",
+        features={"nats": float(np.log1p(gain.sum())), "size": float(np.log(fraction / _LEAST))},
         ties=(*kin, rival[2].id) if gain.sum() - rival[0].sum() < np.log(ODDS) else kin,
         verified=True,  # each piece by the others
     )
