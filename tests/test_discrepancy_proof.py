@@ -98,7 +98,8 @@ def test_what_is_left_beyond_resolution_is_not_of_the_base():
     comparison = types.SimpleNamespace(noises=np.ones(2), sigmas=[np.full(2, 2.0)])
     residuals = np.full((5, 2), 10.0), np.full((5, 2), 6.0)
     sides = [(None, [r], float(((r**2).mean(1) - 1).sum())) for r in residuals]
-    assert _closed(comparison, *sides, 0.05, [0]) == pytest.approx(1 - np.sqrt((35 - 3) / (99 - 3)))
+    expected = 1 - np.sqrt(35 / 99), 1 - np.sqrt((35 - 3) / (99 - 3))
+    assert _closed(comparison, *sides, 0.05, [0]) == pytest.approx(expected)
 
 
 def test_what_closes_little_of_its_gap_has_no_name(late, monkeypatch):

@@ -63,8 +63,7 @@ def _gaps(v: Verdict):
         }
         for name, gap in v.gap.items()
     ]
-    closed = [f"    {v.closed:.0%} of the effects' own part is closed"] if math.isfinite(v.closed) else []
-    return [f"  on {v.aside}:", *_table(rows, hidden=set()), *closed]
+    return [f"  on {v.aside}:", *_table(rows, hidden=set()), *([f"    {v.share}"] if v.share else [])]
 
 
 def columns(rows: list[dict], hidden: set[str] = _HIDDEN) -> list[str]:

@@ -237,7 +237,8 @@ class Verdict:
       effects: named and added, what closes most first. not_named: seen, and too weak or contradicted.
       gap: what is compared -> Gap, on held-out data. lead: which of them the headline is about; empty: the
         one that is most above noise. aside: what these data are, in words.
-      closed: share that all effects close of their own part of the gap, nan where there is none.
+      closed: share that all effects close of their own part of the gap, nan where there is none or the data
+        do not tell it within ten points; closed_within: least and most of it.
       where: cells that disagree, dicts with "channel", the clearest first; where_note: what the cells are.
       remainder: what is left; unknown: whether something is left that has no name.
       tried: dicts with "name", one for each cause that was tried; tried_note: what their numbers are.
@@ -258,6 +259,7 @@ class Verdict:
     warnings: list[str] = dataclasses.field(default_factory=list)
     not_named: list[Finding] = dataclasses.field(default_factory=list)
     closed: float = math.nan
+    closed_within: tuple[float, float] = (math.nan, math.nan)
     where: list[dict] = dataclasses.field(default_factory=list)
     where_note: str = ""
     remainder: str = ""
@@ -317,6 +319,17 @@ class Verdict:
         return f"{name}, {before:.3g} {gap.unit} RMS, amended {after:.3g}" if name else ""
 
     @property
+    def share(self) -> str:
+        """What share is closed, in words; nothing where there is none."""
+        low, high = self.closed_within
+        if math.isnan(low):
+            return ""
+        what = "of the effects' own part of the gap"
+        if math.isnan(self.closed):
+            return f"between {low:.0%} and {high:.0%} {what} is closed: these data do not tell it closer"
+        return f"{self.closed:.0%} {what} is closed ({low:.0%} .. {high:.0%})"
+
+    @property
     def headline(self) -> str:
         """The verdict in one line: the largest gap, and what closes it, by how much, or another one."""
         gap = self.leading
@@ -362,6 +375,7 @@ class Verdict:
             "not_named": [f.to_dict() for f in self.not_named],
             "gap": {name: gap.to_dict() for name, gap in self.gap.items()},
             "share_closed": self.closed,
+            "share_closed_interval": [*self.closed_within],
             "where": self.where,
             "remainder": {"significant": self.unknown, "text": self.remainder},
             "tried": self.tried,

@@ -36,6 +36,7 @@ class Proof:
     after: dict
     residuals: tuple
     closed: float
+    within: tuple[float, float]
 
 
 def borne_out(comparison: "Comparison", smaller: "Fit", larger: "Fit", aside: np.ndarray) -> bool:
@@ -48,7 +49,7 @@ def borne_out(comparison: "Comparison", smaller: "Fit", larger: "Fit", aside: np
         return False
     _, begin = _begun(comparison, smaller, aside)
     nearer = _nearer(comparison, begin, _measured(comparison, larger, aside), aside)
-    return nearer and _fraction_closed(comparison, smaller, larger, aside) >= SETTINGS.explained
+    return nearer and _fractions_closed(comparison, smaller, larger, aside)[1] >= SETTINGS.explained
 
 
 def _density(comparison, fit, aside):
@@ -83,20 +84,25 @@ def proved(comparison: "Comparison", null: "Fit", current: "Fit", aside: np.ndar
     start, begin = _begun(comparison, null, aside)
     before, first, _ = begin
     if current is null:
-        return Proof(start, before, before, (first, first), float("nan"))
+        return Proof(start, before, before, (first, first), np.nan, (np.nan, np.nan))
     after, last, _ = end = _measured(comparison, current, aside)
     if not _nearer(comparison, begin, end, aside):
-        return Proof(start, before, before, (first, first), 0.0)
+        return Proof(start, before, before, (first, first), 0.0, (0.0, 0.0))
     if current.effects:
-        closed = _fraction_closed(comparison, null, current, aside)
+        least, most = _fractions_closed(comparison, null, current, aside)
     else:
-        closed = _closed(comparison, begin, end, SETTINGS.law, aside)
-    return Proof(current, before, after, (first, last), closed)
+        least, most = _closed(comparison, begin, end, SETTINGS.law, aside)
+    # what a law lacks is in part taken for errors of poses and of the base
+    law = SETTINGS.law if any(not effect.wiring for effect, _ in current.effects) else 0.0
+    told = most - least <= 2 * SETTINGS.law
+    closed = 1 - float(np.hypot(1 - most, law)) if told else np.nan
+    within = max(least - law, 0.0), min(most + law, 1.0)
+    return Proof(current, before, after, (first, last), closed, within)
 
 
-def _fraction_closed(comparison, smaller, larger, aside):
-    """Share of the gap that the effects which one Fit has beyond another close by themselves, with all that
-    the base model is found to be off by on both sides."""
+def _fractions_closed(comparison, smaller, larger, aside):
+    """Least and most share of the gap that the effects which one Fit has beyond another close by themselves,
+    with all that the base model is found to be off by on both sides."""
     known = {effect.id for effect, _ in smaller.effects}
     new = np.array([effect.id not in known for effect, _ in larger.effects])
     bare = dataclasses.replace(
@@ -168,17 +174,18 @@ def _independent(comparison, i):
 
 
 def _closed(comparison, before, after, law, aside):
-    """Fraction of the root mean square residual in the readings that effects act on which they remove; law:
-    relative error of their laws.
+    """Least and most fraction of the root mean square residual in the readings that effects act on which they
+    remove; law: relative error of their laws.
 
     The remainder beyond noise is expected to be this error and that of the base model, at most the model's
-    resolution."""
+    resolution; least: it is this error alone."""
     (_, first, begun), (_, last, left) = before, after
     change = sum((((a - b) / comparison.noises) ** 2).mean(1).sum() for a, b in zip(first, last))
     base = sum(
         len(r) * ((comparison.sigmas[i] / comparison.noises) ** 2 - 1).mean() for i, r in zip(aside, last)
     )
-    remains = max(left, 0.0)
-    of_base = min(base, remains * base / max(law**2 * change + base, 1e-12))
-    lacking, hidden = remains - of_base, begun - of_base
-    return float(1 - np.sqrt(lacking / hidden)) if hidden > lacking else 0.0
+    remains, out = max(left, 0.0), []
+    for of_base in (0.0, min(base, remains * base / max(law**2 * change + base, 1e-12))):
+        lacking, hidden = remains - of_base, begun - of_base
+        out.append(float(1 - np.sqrt(lacking / hidden)) if hidden > lacking else 0.0)
+    return tuple(out)

@@ -316,6 +316,7 @@ def _settle(given, comparison, null, search, chosen, aside, notes, usable):
         gap=gaps,
         aside=f"{len(aside)} trajectories that took no part in the search, errors of their poses taken out",
         closed=proof.closed,
+        closed_within=proof.within,
         where=cells,
         where_note=(
             f"{len(cells)} pairs of channel and condition stand out, 5 % false all together; the model is "
