@@ -31,7 +31,6 @@ from ..short_repr import short_repr
 from ..skin import liquid, transfer
 from ..skin.condensed import step as condensed_step
 from ..skin.contact import meshes, outside
-from ..skin.contact.penetration import rest_gap
 from ..skin.geoms import shapes_of
 from ..skin.newton.worlds import BLOCK
 from ..skin.per_world import make_room
@@ -40,7 +39,7 @@ from ..skin.rubber.material import Material
 from ..skin.settings import Settings as SkinModelSettings
 from ..skin.settings import read_material
 from ..skin.step import kernels_for_cuda
-from . import kernels, rest
+from . import clearance, kernels, rest
 from .ahead import kernels_of_step, launched_by
 from .batch import Batch
 from .hook import Hook
@@ -54,7 +53,7 @@ if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
 # what takes long to compile, or is launched first: it begins before the skin is made
-_KERNELS = [rest_gap.module, meshes, closest, liquid, rest, rounds, film_kernels, core_surface]
+_KERNELS = [meshes, closest, liquid, rest, rounds, film_kernels, core_surface]
 _KERNELS += [kernels, transfer, acquisition_kernels, poses, rows, energy, integrator]
 # keywords of `biotac_mj.attach` that a batch has no use for
 _NOT_OF_WORLDS = ("device", "stepper", "on_error")
@@ -248,7 +247,8 @@ def _skins(mjm, prefix, chosen, nworld, device, worlds, of_engine=()):
     touching.warn()  # not once a model: another may have been where this one is
     of_tier = condensed_step.kernels_for_cuda if config.tier == "condensed" else kernels_for_cuda
     first = of_tier(shapes_of([geom.type for geom in touching.geoms]))
-    compile_ahead(device, [*first, *of_engine, (outside, BLOCK), *((module, 256) for module in _KERNELS)])
+    of_blocks = [(clearance, BLOCK), (outside, BLOCK), (integrator.step.module, integrator.BLOCK)]
+    compile_ahead(device, [*first, *of_engine, *of_blocks, *((module, 256) for module in _KERNELS)])
     rubber, skin_options, modulus = skin_settings(config)
     differ = worlds or {}
     room = make_room(skin_options, modulus, differ, len(geometry.elem))

@@ -344,24 +344,22 @@ class SkinModel:
     def core(self, nworld: int) -> GeomSet:
         """The rigid core as the only geom that the inner surface can touch, without friction."""
         if nworld not in self._cores:
-            grid = _core_grid(self.geometry.core_vert.tobytes(), self.geometry.core_face.tobytes())
-            self._cores[nworld] = GeomSet(
-                ["mesh"], [(0, 0, 0)], friction=[0.0], grids=[grid], nworld=nworld, device=self.device
-            )
+            self._cores[nworld] = self._core_geoms(nworld, self.device)
         return self._cores[nworld]
+
+    def _core_geoms(self, nworld, device):
+        grid = _core_grid(self.geometry.core_vert.tobytes(), self.geometry.core_face.tobytes())
+        return GeomSet(["mesh"], [(0, 0, 0)], friction=[0.0], grids=[grid], nworld=nworld, device=device)
 
     def _core_faces(self) -> np.ndarray:
         """Inner faces that can touch the core: not those closer to it than the clearance, which are bonded to
         it or cut into it."""
         face = self.geometry.inner_face
-        gap = wp.zeros(len(face) * len(self.sample), dtype=real, device=self.device)
-        wp.launch(
-            rest_gap,
-            dim=(len(face), len(self.sample)),
-            inputs=[self.inner.face, self.sample, self.core(1).struct, self.vert],
-            outputs=[gap],
-            device=self.device,
-        )
+        core, count = self._core_geoms(1, "cpu"), len(face) * len(self.sample)
+        gap = wp.zeros(count, dtype=real, device="cpu")
+        inner, sample, vert = (of.to("cpu") for of in (self.inner.face, self.sample, self.vert))
+        # on CUDA this kernel, which is needed once, takes half a minute to compile
+        wp.launch(rest_gap, (len(face), len(sample)), [inner, sample, core.struct, vert], [gap], device="cpu")
         return face[gap.numpy().reshape(len(face), -1).min(1) > self.options.core_clearance]
 
     def _core_slots(self):

@@ -226,7 +226,7 @@ def write_slope(c: Correction):
             c.matrix[w, row * (n + 1) + n] = float(lacks[b] / _scale(row))
 
 
-@wp.kernel
+@wp.kernel(module=kernel_module(f"{__name__}.step"))  # with blocks of its own size
 def step(c: Correction):
     """A step of Newton's method, by the threads of a block."""
     w, t = wp.tid()
