@@ -77,12 +77,9 @@ _SENSOR = (
 _NOT_SEARCHED = (Noise(), DeadTaxels(), Modulus())
 
 
-def entries(fits: str | None = None) -> tuple[Entry, ...]:
-    """The effects that are searched in "poses", in a "log" or on a "plate"; None: all."""
-    plate = ()
-    if fits in (None, "plate"):
-        from .plate import PLATE as plate  # it imports the skin
-    return tuple(e for e in (*_SENSOR, *_NOT_SEARCHED, *LOGGED, *plate) if fits is None or fits in e.fits)
+def entries(fits: str) -> tuple[Entry, ...]:
+    """The effects that are searched in "poses" or in a "log"."""
+    return tuple(e for e in (*_SENSOR, *_NOT_SEARCHED, *LOGGED) if fits in e.fits)
 
 
 CATALOGUE = entries("poses")

@@ -168,8 +168,8 @@ class Entry:
 
     Attributes:
       id, name: of the effect. stage: key of STAGES. physics: description.
-      fits: data in which the effect is searched, a set of "poses" (trajectories with the object's poses),
-        "log" (recordings without) and "plate" (presses of a flat plate). An id may have a form for each.
+      fits: data in which the effect is searched, a set of "poses" (trajectories with the object's poses)
+        and "log" (recordings without). An id may have a form for each.
       params: {name: Param}.
       confusable: {id: experiment that separates the two}. equivalents: ids of other laws with the same
         appearance, separated only by much evidence. refit_with: ids of effects that are fitted with it.

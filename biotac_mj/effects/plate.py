@@ -14,12 +14,11 @@ from ..geometry.surface import node_normals
 from ..sensor.film import excitation_places
 from ..skin import Material, SkinOptions
 from ..skin.rubber.material import CALIBRATED_FILL, PRESETS
-from .effect import Entry, Param
+from .effect import Entry
 
 RADIUS = PRESETS["calibrated"].electrode_radius  # [m] of the base model's electrodes
 _FADE = 2e-3  # [m] distance from fixed nodes over which a shift of the wall fades
 _TIP = -14e-3, -10e-3  # [m] range over which a shift of the tip's wall fades
-_FAR = 3.0  # times the solved change up to which it is extrapolated linearly: CHOSEN
 
 
 def moved(geometry: SkinGeometry, outer: float, inner: float, tip: bool = False) -> SkinGeometry:
@@ -85,13 +84,7 @@ class PlateEffect(Entry):
     shape: Callable[[SkinGeometry], SkinGeometry] | None = None
     attach: Callable[[float], dict] | None = None
 
-    fits = frozenset({"plate"})
-
-    @property
-    def params(self) -> dict:
-        by = self.other - self.base
-        low, high = sorted((self.base - _FAR * by, self.base + _FAR * by))
-        return {self.parameter: Param(self.unit, low, high, "a straight line: CHOSEN", abs(by), self.base)}
+    fits = frozenset()  # it has a search of its own
 
     @property
     def solved_anew(self) -> bool:

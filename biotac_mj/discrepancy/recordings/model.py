@@ -124,9 +124,9 @@ class Model:
         c = len(self.used)
         return self.whole if value is None else np.concatenate([value, self.whole[:, c:]], axis=1)
 
-    def moments(self) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
-        """Moments of changes within windows of the fitted bins: rows of a window, moments (w, q, q) of
-        electrodes and products, floor (q,) of a window's noise, and centres (w,) [s]."""
+    def moments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Moments (w, q, q) of changes of electrodes and products within windows of the fitted bins, floor
+        (q,) of a window's noise, and centres (w,) [s]."""
         whole = self.whole[self.inside]
         span = max(4, int(min(CHANGES / self.period, len(whole) // 32)))
         w = len(whole) // span
@@ -134,7 +134,7 @@ class Model:
         cells = cells - cells.mean(1, keepdims=True)
         floor = np.concatenate([self.noise**2, np.full(whole.shape[1] - len(self.used), _FLOOR)]) * span
         middle = self.time[: w * span].reshape(w, span).mean(1)
-        return span, np.einsum("wsi,wsj->wij", cells, cells), floor, middle
+        return np.einsum("wsi,wsj->wij", cells, cells), floor, middle
 
     def levels(self, series: np.ndarray, every: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Means (w, ...) of a series (m, ...) over cells, of the bins fitted or of all, and the cells' times

@@ -205,7 +205,7 @@ def _gains(session, k, since):
     if not m.dimensions or k not in m.used:
         return ()  # nothing moves: an offset; a gain would have no effect
     i = int(np.flatnonzero(m.used == k)[0])
-    _, moment, floor, middle = m.moments()
+    moment, floor, middle = m.moments()
     after = middle > since
     if min(after.sum(), (~after).sum()) < 2:
         return ("gain", "flip")
