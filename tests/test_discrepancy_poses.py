@@ -175,7 +175,7 @@ def test_a_verdict_on_poses_warns_of_all_that_import_names(tmp_path, monkeypatch
 
     def diagnose(sim, data, **settings):
         beliefs = types.SimpleNamespace(save=lambda *_: None)
-        words = dict.fromkeys(("kind", "name", "data", "verdict", "aside"), "none")
+        words = dict.fromkeys(("kind", "name", "data", "aside"), "none")
         return Found(
             **words, significant=False, effects=[], gap={"force": Gap("N", 1.0, 1.0, 1.0)}, beliefs=beliefs
         )
