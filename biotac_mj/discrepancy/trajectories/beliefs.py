@@ -214,7 +214,7 @@ class Beliefs:
             ]
             for key in ("explanations", "unseen")
         )
-        noise = {k: None if v is None else np.array(v) for k, v in document["noise"].items()}
+        noise = {k: None if v is None else np.atleast_1d(v) for k, v in document["noise"].items()}
         rest = document["repeatability"], noise, document["end"], document["doubts"], unseen
         return cls(explanations, *rest, document["beside"]), sim
 

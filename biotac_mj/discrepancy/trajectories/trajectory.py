@@ -42,52 +42,40 @@ class Trajectory:
     touch: int = 0
 
     def __post_init__(self):
-        n = len(self.time)
-        shapes = {
-            "pos": (n, 3),
-            "mat": (n, 3, 3),
-            "electrodes": (n, *np.shape(self.electrodes)[1:2]),
-            "pdc": (n,),
-            "tdc": (n,),
-            "force": (n, 3),
-        }
+        n, what = len(self.time), f"trajectory {self.id!r}"
+        shapes = {"pos": (n, 3), "mat": (n, 3, 3), "electrodes": (n, *np.shape(self.electrodes)[1:2])}
+        shapes |= {"pdc": (n,), "tdc": (n,), "force": (n, 3)}
         for name, shape in shapes.items():
             value = getattr(self, name)
             if value is None:
                 continue
             if np.shape(value) != shape:
                 raise ValueError(
-                    f"{name} of trajectory {self.id!r} has shape {np.shape(value)}: "
-                    f"{shape} is needed, one row per time"
+                    f"{name} of {what} has shape {np.shape(value)}: {shape} is needed, one row per time"
                 )
             if not np.isfinite(value).all():
                 raise ValueError(
-                    f"{name} of trajectory {self.id!r} has values that are not finite: "
-                    "cut the trajectory there, or leave it out"
+                    f"{name} of {what} has values that are not finite: cut the trajectory there, or leave it "
+                    "out"
                 )
         if n < 8:
-            raise ValueError(
-                f"trajectory {self.id!r} has {n} rows: at least 8 are needed, from before the touch on"
-            )
+            raise ValueError(f"{what} has {n} rows: at least 8 are needed, from before the touch on")
         step = np.diff(self.time)
         if not (step > 0).all():
-            raise ValueError(
-                f"the time of trajectory {self.id!r} does not increase: sort its rows and drop repeated ones"
-            )
+            raise ValueError(f"the time of {what} does not increase: sort its rows and drop repeated ones")
         if step.max() > 100 * np.median(step):
             raise ValueError(
-                f"the clock of trajectory {self.id!r} has a gap of {step.max():.3g} s where rows are "
-                f"{np.median(step):.3g} s apart: cut it in two "
-                "there; what happened meanwhile cannot be guessed"
+                f"the clock of {what} has a gap of {step.max():.3g} s where rows are {np.median(step):.3g} s "
+                "apart: cut it in two there; what happened meanwhile cannot be guessed"
             )
         if np.abs(self.pos).max() > 0.5:
             raise ValueError(
-                f"pos of trajectory {self.id!r} reaches {np.abs(self.pos).max():.3g}: "
-                "metres are needed, these look like millimetres"
+                f"pos of {what} reaches {np.abs(self.pos).max():.3g}: metres are needed, these look like "
+                "millimetres"
             )
-        check_counts(self.electrodes, f"trajectory {self.id!r}")
+        check_counts(self.electrodes, what)
         if self.force is not None:
-            check_force(self.force, f"trajectory {self.id!r}")
+            check_force(self.force, what)
 
     @property
     def heading(self) -> np.ndarray:
@@ -195,21 +183,14 @@ def write_trajectories(path: pathlib.Path | str, trajectories: list[Trajectory])
 
 
 def measurement_noise(trajectories: list[Trajectory]) -> dict:
-    """Standard deviations: electrodes (nelectrode,) [counts], pdc [counts], force (3,) [N].
+    """Standard deviations: electrodes (nelectrode,) [counts], pdc (1,) [counts], force (3,) [N].
 
     From second differences of rows while the object rests, in air or held; where there are too few of them,
     of all rows."""
-    out = {
-        "electrodes": _noise([t.electrodes for t in trajectories], trajectories, 2.0),
-        "pdc": None,
-        "force": None,
-    }
-    if any(t.pdc is not None for t in trajectories):
-        out["pdc"] = float(
-            _noise([None if t.pdc is None else t.pdc[:, None] for t in trajectories], trajectories, 1.0)[0]
-        )
-    if any(t.force is not None for t in trajectories):
-        out["force"] = _noise([t.force for t in trajectories], trajectories, 0.005)
+    out = {}
+    for name, least in (("electrodes", 2.0), ("pdc", 1.0), ("force", 0.005)):
+        known = [(getattr(t, name), t) for t in trajectories if getattr(t, name) is not None]
+        out[name] = _noise([(x.reshape(len(x), -1), t) for x, t in known], least) if known else None
     return out
 
 
@@ -222,12 +203,12 @@ def _still(t):
     return step < np.clip(_TREMBLE * np.percentile(step, 10), least, most)
 
 
-def _noise(values, trajectories, least):
-    pairs = [(x, t) for x, t in zip(values, trajectories) if x is not None]
+def _noise(pairs, least):
+    """(k,) standard deviations by values (n, k) and the trajectory of each."""
     rest = []
     for x, t in pairs:
-        still = _still(t)
-        even = np.abs(np.diff(t.time, n=2)) < 0.2 * np.minimum(np.diff(t.time)[1:], np.diff(t.time)[:-1])
+        still, step = _still(t), np.diff(t.time)
+        even = np.abs(np.diff(step)) < 0.2 * np.minimum(step[1:], step[:-1])
         rest.append(np.diff(x, n=2, axis=0)[still[1:] & still[:-1] & even])
     rest = np.concatenate(rest)
     if len(rest) >= 20:

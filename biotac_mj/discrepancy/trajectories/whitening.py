@@ -44,29 +44,19 @@ class Comparison:
         self.has_pdc = all(t.pdc is not None for t in self.trajectories)
         self.has_force = all(t.force is not None for t in self.trajectories)
         self.rest_pdc = np.mean([t.pdc[0] for t in self.trajectories]) if self.has_pdc else 0.0
-        n = width = self.nelectrode = self.sim.design.nelectrode
-        self.groups = {"electrodes": slice(0, n)}
-        if self.has_pdc:
-            self.groups["pdc"] = slice(width, width + 1)
-            width += 1
-        if self.has_force:
-            self.groups["force"] = slice(width, width + 3)
-            width += 3
-        self.width = width
+        self.nelectrode, self.width, self.groups = self.sim.design.nelectrode, 0, {}
+        sizes = {"electrodes": self.nelectrode, "pdc": int(self.has_pdc), "force": 3 * self.has_force}
+        for name, size in sizes.items():
+            if size:
+                self.groups[name] = slice(self.width, self.width + size)
+                self.width += size
         self.measured = [
             self._stack(t.electrodes - self.rest, None if t.pdc is None else t.pdc - self.rest_pdc, t.force)
             for t in self.trajectories
         ]
-        sigma = np.concatenate(
-            [
-                self.noise["electrodes"],
-                *([[self.noise["pdc"]]] if self.has_pdc else []),
-                *([self.noise["force"]] if self.has_force else []),
-            ]
-        )
-        self.noises, self.likelihoods = sigma, {}
+        self.noises, self.likelihoods = np.concatenate([self.noise[name] for name in self.groups]), {}
         # One deep press decides nothing of what the light ones can show.
-        self.sigmas = np.array([np.hypot(sigma, self._floor(m)) for m in self.measured])
+        self.sigmas = np.array([np.hypot(self.noises, self._floor(m)) for m in self.measured])
         self.sigma = np.sqrt((self.sigmas**2).mean(0))
         self._prepare()
 
