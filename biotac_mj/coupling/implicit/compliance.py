@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import warp as wp
 
-from ...kernels import kernel_module
+from ...kernels import add_zeros, kernel_module, set_fields
 from ...skin.block import MEMORY, block_memory, block_rank, sync
 from ...skin.types import real, vec6
 from .rounds import Model
@@ -187,25 +187,30 @@ def holds(model: Model, g: int, w: int):
     return wp.ddot(model.tangent0[g, w], model.tangent0[g, w]) > real(0.0)
 
 
+@wp.struct
+class Columns:
+    """Response of the bodies that touch a skin to a unit of each component of the wrenches on them, a
+    column."""
+
+    jacobian: wp.array3d(dtype=vec6)  # of the bodies
+    model: Model
+    # accelerations of the degrees of freedom [world, dof, column]; by what all skins do against such a motion
+    found: wp.array3d(dtype=real)
+    driven: wp.array3d(dtype=real)
+    # contribution [world, column] to the traces of the second and the fourth power of the modal matrix, in
+    # which the highest frequency dominates
+    power: wp.array2d(dtype=wp.vec2d)
+
+
 @wp.kernel
-def give(
-    # In:
-    going: wp.array(dtype=int),
-    L: wp.array3d(dtype=real),
-    jacobian: wp.array3d(dtype=vec6),
-    model: Model,
-    held: int,
-    # Out:
-    response_out: wp.array3d(dtype=real),
-):
-    """Accelerations of the degrees of freedom by a unit of the wrench on one body. held: of those alone that
-    the skin holds."""
+def give(going: wp.array(dtype=int), L: wp.array3d(dtype=real), held: int, columns: Columns):
+    """Finds the accelerations. held: of those alone that the skin holds."""
     w, c = wp.tid()
-    if going[w] == 0 or (held == 1 and not holds(model, c / 6, w)):
+    if going[w] == 0 or (held == 1 and not holds(columns.model, c / 6, w)):
         return
     for i in range(L.shape[1]):
-        response_out[w, i, c] = jacobian[c / 6, w, i][c % 6]
-    substitute(L, w, c, response_out)
+        columns.found[w, i, c] = columns.jacobian[c / 6, w, i][c % 6]
+    substitute(L, w, c, columns.found)
 
 
 @wp.kernel
@@ -213,8 +218,7 @@ def move(
     # In:
     going: wp.array(dtype=int),
     square: wp.array2d(dtype=real),
-    jacobian: wp.array3d(dtype=vec6),
-    response: wp.array3d(dtype=real),
+    columns: Columns,
     # Out:
     compliance_out: wp.array4d(dtype=real),
 ):
@@ -222,13 +226,13 @@ def move(
     w, c = wp.tid()
     if going[w] == 0:
         return
-    groups = jacobian.shape[0]
+    groups = columns.jacobian.shape[0]
     for g in range(groups):
         m = vec6()
         # of two bodies whose steps differ the mean, so that it stays symmetric
         both = wp.sqrt(square[g, w] * square[c / 6, w])
-        for i in range(response.shape[1]):
-            m += (both * response[w, i, c]) * jacobian[g, w, i]
+        for i in range(columns.found.shape[1]):
+            m += (both * columns.found[w, i, c]) * columns.jacobian[g, w, i]
         for b in range(6):
             compliance_out[groups * g + c / 6, w, b, c % 6] = m[b]
 
@@ -252,64 +256,49 @@ def add_stiffness(
 
 @wp.kernel
 def drive(
-    # In:
     taking_part: wp.array(dtype=int),
     stiffness: wp.array3d(dtype=real),
     L: wp.array3d(dtype=real),
-    response: wp.array3d(dtype=real),
-    model: Model,
-    # Out:
-    driven_out: wp.array3d(dtype=real),
+    columns: Columns,
 ):
-    """Accelerations by what all skins do against motions of the degrees of freedom [world, dof, column]; of
-    the wrenches on bodies that this skin holds."""
+    """Finds the accelerations by what all skins do [world, dof, dof], of bodies that this skin holds."""
     w, c = wp.tid()
-    if taking_part[w] == 0 or not holds(model, c / 6, w):
+    if taking_part[w] == 0 or not holds(columns.model, c / 6, w):
         return
     for i in range(stiffness.shape[1]):
         held = real(0.0)
         for j in range(stiffness.shape[1]):
-            held += stiffness[w, i, j] * response[w, j, c]
-        driven_out[w, i, c] = held
-    substitute(L, w, c, driven_out)
+            held += stiffness[w, i, j] * columns.found[w, j, c]
+        columns.driven[w, i, c] = held
+    substitute(L, w, c, columns.driven)
 
 
 @wp.kernel
-def add_powers(
-    # In:
-    taking_part: wp.array(dtype=int),
-    stiffness: wp.array3d(dtype=real),
-    response: wp.array3d(dtype=real),
-    driven: wp.array3d(dtype=real),
-    model: Model,
-    # Out:
-    power_out: wp.array2d(dtype=wp.vec2d),
-):
-    """Contribution of each wrench on a skin's bodies [world, column] to the traces of the second and the
-    fourth power of the modal matrix, in which the highest frequency dominates."""
+def add_powers(taking_part: wp.array(dtype=int), stiffness: wp.array3d(dtype=real), columns: Columns):
+    """Finds the powers."""
     w, c = wp.tid()
     g = c / 6
     second = vec6()
     fourth = vec6()
-    if taking_part[w] == 1 and holds(model, g, w):
+    if taking_part[w] == 1 and holds(columns.model, g, w):
         for i in range(stiffness.shape[1]):
             once = real(0.0)
             twice = real(0.0)
             for j in range(stiffness.shape[1]):
-                once += stiffness[w, i, j] * response[w, j, c]
-                twice += stiffness[w, i, j] * driven[w, j, c]
+                once += stiffness[w, i, j] * columns.found[w, j, c]
+                twice += stiffness[w, i, j] * columns.driven[w, j, c]
             for b in range(6):
-                second[b] = second[b] + once * response[w, i, 6 * g + b]
-                fourth[b] = fourth[b] + twice * driven[w, i, 6 * g + b]
-    T = model.tangent0[g, w]
-    power_out[w, c] = wp.vec2d((T * second)[c % 6], (T * fourth)[c % 6])
+                second[b] = second[b] + once * columns.found[w, i, 6 * g + b]
+                fourth[b] = fourth[b] + twice * columns.driven[w, i, 6 * g + b]
+    T = columns.model.tangent0[g, w]
+    columns.power[w, c] = wp.vec2d((T * second)[c % 6], (T * fourth)[c % 6])
 
 
 @wp.kernel
 def find_frequencies(
     # In:
     taking_part: wp.array(dtype=int),
-    power: wp.array2d(dtype=wp.vec2d),
+    columns: Columns,
     # Out:
     frequency_out: wp.array2d(dtype=real),
 ):
@@ -320,7 +309,7 @@ def find_frequencies(
         return
     total = wp.vec2d()
     for c in range(6 * g, 6 * g + 6):
-        total += power[w, c]
+        total += columns.power[w, c]
     frequency = real(0.0)
     if total[0] > real(0.0) and total[1] > real(0.0):
         frequency = wp.sqrt(wp.sqrt(total[1] / total[0]))
@@ -335,11 +324,14 @@ class Response:
     """
 
     def __init__(self, jacobian: wp.array, model: Model):
-        (groups, nworld, nv), self._jacobian, self._model = jacobian.shape, jacobian, model
-        self._columns = nworld, 6 * groups
+        groups, nworld, nv = jacobian.shape
+        self._shape, self._columns = (
+            (nworld, 6 * groups),
+            set_fields(Columns(), jacobian=jacobian, model=model),
+        )
         with wp.ScopedDevice(jacobian.device):
-            self._found, self._driven = (wp.zeros((nworld, nv, 6 * groups), dtype=real) for _ in range(2))
-            self._power = wp.zeros(self._columns, dtype=wp.vec2d)
+            add_zeros(self._columns, "found driven", nworld, nv, 6 * groups)
+            add_zeros(self._columns, "power", *self._shape)
 
     def compliance(self, going: wp.array, L: wp.array, square: wp.array, out: wp.array) -> list[tuple]:
         """Computes the compliance [group, group, world] with factors of `factor`, in the worlds marked in
@@ -349,8 +341,8 @@ class Response:
         shape, where = (groups * groups, nworld, 6, 6), out.device
         entries = wp.array(ptr=out.ptr, shape=shape, dtype=real, device=where, copy=False)
         return [
-            (give, self._columns, [going, L, self._jacobian, self._model, 0, self._found]),
-            (move, self._columns, [going, square, self._jacobian, self._found, entries]),
+            (give, self._shape, [going, L, 0, self._columns]),
+            (move, self._shape, [going, square, self._columns, entries]),
         ]
 
     def frequencies(
@@ -358,11 +350,9 @@ class Response:
     ) -> list[tuple]:
         """Finds the frequency of each body [group, world], with factors in which no skin holds anything;
         stiffness: of all skins (nworld, nv, nv)."""
-        known, model = [taking_part, stiffness], self._model
-        held = [self._found, self._driven, model, self._power]
         return [
-            (give, self._columns, [taking_part, L, self._jacobian, model, 1, self._found]),
-            (drive, self._columns, [*known, L, self._found, model, self._driven]),
-            (add_powers, self._columns, [*known, *held]),
-            (find_frequencies, out.shape, [taking_part, self._power, out]),
+            (give, self._shape, [taking_part, L, 1, self._columns]),
+            (drive, self._shape, [taking_part, stiffness, L, self._columns]),
+            (add_powers, self._shape, [taking_part, stiffness, self._columns]),
+            (find_frequencies, out.shape, [taking_part, self._columns, out]),
         ]
