@@ -13,7 +13,8 @@ _MOST = 0.9
 
 
 class Coupled:
-    """One of the skins of a `SkinGroup`. Its model is wrench0 - tangent (pose - pose0).
+    """One of the skins of a `SkinGroup`, which gives it the structs and arrays that its kernels work on. Its
+    model is wrench0 - tangent (pose - pose0).
 
     Args:
       arrays: of the group. number: of the skin. bodies: where they are in the arrays.
@@ -84,5 +85,5 @@ class Coupled:
         """Tells the instance how the step went."""
         acting = self.instance.seen(self.part("acting"))
         withheld = 1.0 - self.part("push").min(initial=1.0)
-        of_bodies = (self.part(name).copy() for name in ("gamma", "frequency"))
-        self.instance.outcome = Outcome(rounds, self.settled, withheld, None, acting, *of_bodies)
+        frequency = self.part("frequency").copy()
+        self.instance.outcome = Outcome(rounds, self.settled, withheld, None, acting, frequency)
