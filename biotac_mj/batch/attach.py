@@ -12,6 +12,7 @@ import warp as wp
 from ..coupling.config import Config, refuse_two_way
 from ..coupling.handle import SENSORS
 from ..coupling.implicit import energy, poses, rounds, rows
+from ..coupling.implicit.metric import roots_of
 from ..coupling.instance import NO_CONTACT, NO_PASSIVE
 from ..coupling.sensing.counts import film_of
 from ..coupling.settings import SensorSettings, SettingKeywords, Settings
@@ -331,9 +332,7 @@ def _check_model(mjm, coupling):
 def _slots(mjm, m, d, touching, prefix):
     """{group that moves against the BioTac: weld constraint whose rows it gets}; the other welds are switched
     off, in m and d."""
-    core, tree = touching.core, mjm.body_treeid
-    roots = [int(mjm.body_weldid[b]) if tree[b] >= 0 else 0 for b in touching.body]
-    needed = sorted({root for root in roots if root or tree[core] >= 0})
+    roots, needed = roots_of(mjm, touching)
     welds = [i for i in range(mjm.neq) if (mjm.eq(i).name or "").startswith(prefix + "couple")]
     place = {int(mjm.body_weldid[mjm.eq_obj2id[i]]): i for i in welds}
     without = [mjm.body(root).name or f"#{root}" for root in needed if root not in place]

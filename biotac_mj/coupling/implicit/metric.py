@@ -38,8 +38,7 @@ def assign_slots(model: ModelView, touching: Touching, slots: list[int]) -> dict
     Raises:
       ValueError: there are fewer slots than bodies that can touch.
     """
-    core, tree = touching.core, model.body_treeid
-    needed = [root for root in sorted(set(_roots(model, touching))) if root or tree[core] >= 0]
+    core, tree, (_, needed) = touching.core, model.body_treeid, roots_of(model, touching)
     if len(needed) > len(slots):
         raise ValueError(
             f"{len(needed)} bodies can touch the BioTac {model.name('body', core)!r} but it has "
@@ -56,10 +55,12 @@ def assign_slots(model: ModelView, touching: Touching, slots: list[int]) -> dict
     return out
 
 
-def _roots(model, touching):
-    """Of the welds of the bodies that can touch; 0: the world."""
-    body = touching.body
-    return np.where(model.body_treeid[body] >= 0, model.body_weldid[body], 0).tolist()
+def roots_of(model: ModelView | mujoco.MjModel, touching: Touching) -> tuple[list[int], list[int]]:
+    """Root of the weld of each body that can touch, 0: the world; and those that move against the BioTac, in
+    order, each of which needs a slot."""
+    body, tree = touching.body, model.body_treeid
+    roots = np.where(tree[body] >= 0, model.body_weldid[body], 0).tolist()
+    return roots, [root for root in sorted(set(roots)) if root or tree[touching.core] >= 0]
 
 
 class Metric:
@@ -86,7 +87,7 @@ class Metric:
         count = 0
         for touching, one in zip(touchings, slots):
             place = {root: count + k for k, root in enumerate(one)}
-            self._slot_of += [place.get(root, -1) for root in _roots(model, touching)]
+            self._slot_of += [place.get(root, -1) for root in roots_of(model, touching)[0]]
             count += len(one)
         self._layout, self._filled, self._held = None, False, None
         self.first, self.numbers = np.zeros(0, int), np.zeros(0, int)
