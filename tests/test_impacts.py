@@ -672,6 +672,28 @@ def test_a_body_that_is_led_into_the_core_is_followed_along_it(nv):
     assert (up[:, 3] == 1).all() and (np.diff(up[:, 1]) < 0).all()
 
 
+@pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
+def test_a_ball_that_fell_onto_the_clamp_leans_on_the_skin(tier):
+    """The clamp's contact takes in what it lifts the ball by afterwards, so that the skin's push beside it
+    gives nothing."""
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep="0.002" gravity="0 0 0" integrator="implicitfast" cone="elliptic"/>'
+        '<worldbody><site name="tip" quat="1 1 0 0"/><body name="ball" pos=".00691 0 .0047">'
+        '<joint name="z" type="slide" axis="0 0 1" damping="10"/>'
+        '<geom size="0.0005" mass="0.05" friction=".5"/></body></worldbody>'
+        '<actuator><motor joint="z"/></actuator></mujoco>'
+    )
+    handle = biotac_mj.attach(spec, site="tip", skin="coarse", tier=tier, readings=False, friction=0.5)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.ctrl[0] = -1.0
+    mujoco.mj_step(model, data, 60)
+    force, status = (handle.read(data, name) for name in ("contact_force", "status"))
+    assert status[0] == 1 and status[7] == 0
+    assert -0.3 < force[0] < -0.1  # 0 where the push is withheld
+    assert force[1] == pytest.approx(-1.0, rel=0.01)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("mass, friction, most", [(0.02, 1.0, 0), (2.335e-3, 2.0, 13)])
 def test_a_light_ball_that_rolls_settles(mass, friction, most):
