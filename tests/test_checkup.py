@@ -138,18 +138,23 @@ def turned_down(x, noise, rng):
     return x
 
 
+def filtered(x, noise, rng):
+    x[2000:, 3] = lfilter([0.5], [1, -0.5], x[2000:, 3] - x[0, 3]) + x[0, 3]
+    return x
+
+
 @pytest.mark.parametrize(
-    "change, name, channels",
+    "change, name, ties, channels",
     [
-        (coupled, "crosstalk", (5, 6)),
-        (shared, "common_noise", range(19)),
-        (turned_down, "gain", (3,)),
+        (coupled, "crosstalk", (), (5, 6)),
+        (shared, "common_noise", (), range(19)),
+        (turned_down, "gain", ("lowpass",), (3,)),
+        (filtered, "gain", ("lowpass",), (3,)),
     ],
 )
-def test_noise_tells_what_electrodes_share_and_their_gain(change, name, channels):
-    assert [(f.id, f.channels) for f in between_rests(Log(resting(change)), RESTS)] == [
-        (name, tuple(channels))
-    ]
+def test_noise_tells_what_electrodes_share_and_their_gain(change, name, ties, channels):
+    (fault,) = between_rests(Log(resting(change)), RESTS)
+    assert (fault.id, fault.ties, fault.channels) == (name, ties, tuple(channels))
 
 
 @pytest.mark.parametrize("seed", range(4))

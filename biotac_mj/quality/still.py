@@ -105,6 +105,7 @@ def _louder(log, off, sound):
             ends = first[:, k].mean(), later[:, k].mean()
             if sum(ends) < 0:  # less than the others have, noise and all
                 found[k] = _of_noise(log, "gain", [k], text, {f"e{k + 1}": float(np.expm1(size))}, strength)
+                found[k].ties = ("lowpass",)
             else:
                 louder = float(np.exp(max(ends)) * noise_level(log.counts)[k])
                 found[k] = _of_noise(log, "noise", [k], text, {"size": louder}, strength)
