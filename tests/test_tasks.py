@@ -296,6 +296,16 @@ def test_an_environment_of_ones_own_is_copied(again):
     env.close(), made.close()
 
 
+def test_an_environment_that_was_given_its_task_says_so():
+    class Given(biotac_mj.tasks.Copyable, composer.Environment):
+        pass
+
+    env = Given(composer.NullTask(composer.Arena()))
+    with pytest.raises(TypeError, match="Given was given its task: only one that it makes is copied"):
+        copy.deepcopy(env)
+    env.close()
+
+
 def test_estimator_recovers_a_map_and_names_its_error():
     """Exact on a map that is linear in touch and quadratic in its shape; the reported error is that of
     episodes it has not seen."""

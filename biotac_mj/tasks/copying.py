@@ -47,6 +47,8 @@ class Copyable:
 
     def __reduce__(self):
         args, settings = self._made_of
+        if any(isinstance(value, composer.Task) for value in (*args, *settings.values())):
+            raise TypeError(f"{type(self).__name__} was given its task: only one that it makes is copied")
         return functools.partial(type(self), *args, **settings), (), take_state(self)
 
     def __setstate__(self, state: dict | None) -> None:
