@@ -186,14 +186,14 @@ def add_view(verbs: argparse._SubParsersAction) -> None:
         metavar="TIME",
         help="how long to simulate before --render",
     )
-    verb.add_argument(
-        "--hand",
-        metavar="FILE",
-        help="MJCF of a hand: show it with BioTacs on its fingertips and a ball instead",
-    )
-    verb.add_argument(
-        "--mount", metavar="FILE", help="with --hand: file of `biotac hand mount` for an unknown hand"
-    )
+    _add_hand(verb)
+
+
+def _add_hand(verb):
+    text = "MJCF of a hand: with BioTacs on its fingertips and a ball"
+    verb.add_argument("--hand", metavar="FILE", help=text)
+    text = "with --hand: file of `biotac hand mount` for an unknown hand"
+    verb.add_argument("--mount", metavar="FILE", help=text)
 
 
 def _view(args):
@@ -229,12 +229,7 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
     )
     add_skin(verb)
     verb.set_defaults(skin=None, tier=None, material=None)
-    verb.add_argument(
-        "--hand", metavar="FILE", help="MJCF of a hand: with BioTacs on its fingertips and a ball"
-    )
-    verb.add_argument(
-        "--mount", metavar="FILE", help="with --hand: file of `biotac hand mount` for an unknown hand"
-    )
+    _add_hand(verb)
     verb.add_argument("--port", type=whole(1, 65535), default=8080, help="port of the page")
     verb.add_argument(
         "--policy",

@@ -113,12 +113,7 @@ def press(
     )
     if not force.any():
         warnings.warn(
-            "the indenter has met no skin that gives way, and nothing was felt: "
-            + (
-                f"{1e3 * path.room:.2f} mm lie over core, nail or clamp at the location; choose another one"
-                if options.depth > 0.05 * path.room
-                else f"it went {1e3 * options.depth:.3g} mm deep; press deeper"
-            ),
+            "the indenter has met no skin that gives way, and nothing was felt: press deeper, or elsewhere",
             stacklevel=2,
         )
     record = PressRecord(
