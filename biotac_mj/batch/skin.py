@@ -256,7 +256,7 @@ def solve_group(skins: Sequence[BatchSkin], fork: Fork) -> None:
 
     def go_on():
         going.zero_()
-        fork.run(*(functools.partial(skin._condensed.go_on, going) for skin in condensed))
+        fork.run(*(functools.partial(skin._condensed.continue_solve, going) for skin in condensed))
 
     going.fill_(1)
     wp.capture_while(going, go_on)

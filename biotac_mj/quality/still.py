@@ -58,7 +58,7 @@ def between_rests(log: Log, rests: Sequence[slice], faults: Sequence[Fault] = ()
         return []
     spread = np.median(np.abs(np.concatenate(off)), axis=0) / norm.ppf(0.75) + ROUNDING
     off = [np.clip(one, -_CALM * spread, _CALM * spread) for one in off]
-    return _in_common(log, np.concatenate(off), sound) + _louder(log, off, sound)
+    return _in_common(log, np.concatenate(off), sound) + _noise_changes(log, off, sound)
 
 
 def _in_common(log, off, sound):
@@ -88,7 +88,7 @@ def _in_common(log, off, sound):
     return found
 
 
-def _louder(log, off, sound):
+def _noise_changes(log, off, sound):
     """Channels whose noise is another one in a later rest than in the first, as their gain is."""
     first, *others = (
         np.log([np.sqrt((part**2).mean(0)) + ROUNDING for part in np.array_split(one, BLOCKS)]) for one in off
@@ -107,8 +107,8 @@ def _louder(log, off, sound):
                 found[k] = _of_noise(log, "gain", [k], text, {f"e{k + 1}": float(np.expm1(size))}, strength)
                 found[k].ties = ("lowpass",)
             else:
-                louder = float(np.exp(max(ends)) * noise_level(log.counts)[k])
-                found[k] = _of_noise(log, "noise", [k], text, {"size": louder}, strength)
+                counts = float(np.exp(max(ends)) * noise_level(log.counts)[k])
+                found[k] = _of_noise(log, "noise", [k], text, {"size": counts}, strength)
                 found[k].ties = ("gain",)
     return list(found.values()) if len(found) <= log.some(_FEW) else []
 

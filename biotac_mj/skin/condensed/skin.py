@@ -133,31 +133,31 @@ class CondensedSkin:
             v["compliance"][:, :, 0], v["predicted"][:, 0] = bodies.compliance, bodies.wrench
             v["origin"][:, 0], v["arm"][:, 0], v["spin"][:, 0] = bodies.pos, bodies.arm, bodies.spin
         self.proximity.pose(pos, mat)
-        let_go = pos, mat
+        free_pose = pos, mat
         if bodies is not None:  # where the bodies go without the skin
             self._uncouple()
-            let_go = tuple(view.copy() for view in self._uncoupled)
+            free_pose = tuple(view.copy() for view in self._uncoupled)
         if not memory.started:  # as in the full tier: friction acts from the first touch on
-            memory = self.outside(*let_go)
+            memory = self.outside(*free_pose)
             self.proximity.pose(pos, mat)
         if bodies is not None or not self.proximity.deep(pos, mat):
-            return self._follow(memory, pos, mat, let_go, most, near)
+            return self._follow(memory, pos, mat, free_pose, most, near)
         shallow, outside = self.proximity.shallow(pos, mat), self.proximity.outside(pos, mat)
         fraction = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
         out = self._follow(memory, shallow, mat, (shallow, mat), most)
         return dataclasses.replace(out, converged=False, load_factor=fraction * out.load_factor)
 
-    def _follow(self, memory, pos, mat, let_go, most, near=None):
-        """Solves for poses that are not too deep. let_go: poses without the skin. most: limit of the cost, in
-        evaluations."""
-        motion, turned = let_go[0] - memory.geom_pos, np.abs(mat - memory.geom_mat).max(initial=0.0)
+    def _follow(self, memory, pos, mat, free_pose, most, near=None):
+        """Solves for poses that are not too deep. free_pose: (pos, mat) without the skin. most: limit of the
+        cost, in evaluations."""
+        motion, turned = free_pose[0] - memory.geom_pos, np.abs(mat - memory.geom_mat).max(initial=0.0)
         far = np.abs(motion).max(initial=0.0) + _LEVER * turned
         if not len(memory.forces) or far > _FAR:
-            if self.proximity.clear(*let_go, 0.0):  # the geoms do not touch the skin, or leave it
-                return self.at_rest(*let_go)
+            if self.proximity.clear(*free_pose, 0.0):  # the geoms do not touch the skin, or leave it
+                return self.at_rest(*free_pose)
         out = self._solve(memory, pos, mat, most, near)
-        if not out.converged and self.proximity.clear(*let_go, 0.0):
-            return dataclasses.replace(self.at_rest(*let_go), cost=out.cost)
+        if not out.converged and self.proximity.clear(*free_pose, 0.0):
+            return dataclasses.replace(self.at_rest(*free_pose), cost=out.cost)
         return out
 
     def _solve(self, memory, pos, mat, most, near):

@@ -116,11 +116,11 @@ class CondensedStep:
         if self._phases:
             going = self._going
             going.fill_(1)
-            launcher.loop(going, lambda: (going.zero_(), self.go_on(going, launcher)))
+            launcher.loop(going, lambda: (going.zero_(), self.continue_solve(going, launcher)))
         self.end(tangent, launcher)
 
     def begin(self, launcher: Launcher | None = None) -> None:
-        """First part: on the CPU the whole solve; on CUDA, call `go_on` until all worlds have finished."""
+        """First part: on the CPU the whole solve; on CUDA call `continue_solve` until all worlds are done."""
         m, d, geoms = self._model, self._data, self._geoms
         launcher, n, c, s = launcher or Launcher(m.device), d.nworld, self._constants, self._scratch
         if self._phases:
@@ -134,7 +134,7 @@ class CondensedStep:
             [s, self.remembered, d.worlds, d.outer.node_force, self.tier],
         )
 
-    def go_on(self, going: wp.array, launcher: Launcher | None = None) -> None:
+    def continue_solve(self, going: wp.array, launcher: Launcher | None = None) -> None:
         """One round on CUDA: broad phase, Newton's method to its end, decision about the load. Sets going[0]
         if a world has not finished."""
         m, d, k = self._model, self._data, self._phases
