@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from grids import covering
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.evidence import further_off
@@ -24,8 +25,7 @@ def test_a_warm_up_lies_within_its_interval(sample):
         assert low < value < high
 
 
-@pytest.mark.parametrize("change", (250.0, -250.0))
-@pytest.mark.parametrize("with_force", (False, True))
+@pytest.mark.parametrize("with_force, change", covering((False, True), (250.0, -250.0)))
 def test_a_slow_common_change_is_of_the_session(sample, change, with_force):
     """In counts, of a sensor that is warm by then: not told from what goes on in ln Z, and no step."""
     counts, force = (part[2600:] for part in sample)
