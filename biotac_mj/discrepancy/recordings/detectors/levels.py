@@ -26,6 +26,7 @@ _WARMER = 0.05  # [K] by which the thermistor has to change
 _ALIKE = 0.9  # correlation of a trend with the thermistor's
 _EXPLAINED = 0.35  # of the evidence that the thermistor alone has to explain
 _NATS = 12.0  # of a drift beside a load
+_ANSWERS = 0.8  # of what a drift explains beside a load, that a change of answers explains as well
 _CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
 _MOSTLY = 0.6  # least fraction of a trend that a multiple of the common one explains
 
@@ -104,8 +105,11 @@ def _under_load(session, rejected, common):
         if trend.size * m.slope[i] < _LEAST or _part_of_common(session, trend, trend.size, common):
             continue
         finding = _single(session, trend, k)
+        answers = every.answers(int(i))
         finding.detector, finding.under_load = "process", True
         finding.features["likelier"] = float(nats[i] / len(trend.gain))
+        if answers > _ANSWERS * nats[i]:
+            finding.ties = ("gain",)
         return finding
     return None
 

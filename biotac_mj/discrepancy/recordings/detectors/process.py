@@ -25,6 +25,7 @@ _LINEAR = (1.0, 10.0)
 _CURVED = ((0.0, 1.0), (0.03, 1.0), (0.3, 1.0), (0.1, 2.0), (1.0, 2.0))
 _MEMORY, _SECONDS = (0.001, 0.01), 1.5
 _DRIFT, _SMOOTH = (0.003, 0.03, 0.3), 0.2  # and its time scale, as a fraction of the recording
+_LOADS = (0.05, 0.25, 0.75, 0.95)  # quantiles of the prediction about which a gain may change
 _NOISE = 0.001
 _LEVEL = 10.0
 _FASTER = (1, 9, 36, 144)  # squares of how much faster a trend may change
@@ -51,14 +52,24 @@ class Process:
         """Gain in log-likelihood of used electrode i by a smooth trend over time."""
         return self._of(i)[0]
 
+    def answers(self, i: int) -> float:
+        """Gain in log-likelihood [nats] by a gain that changes over time, about the load where it is largest:
+        a gain moves levels, too."""
+        nats, without, y, _, _, K, load = self._of(i)
+        said, best = load @ np.linalg.solve(K, y), -np.inf
+        for middle in (0.0, *np.quantile(said, _LOADS)):
+            both = np.outer(said - middle, said - middle) * self._smooth
+            best = max(best, *(_log_likelihood(K + a * both, y) for a in _DRIFT))
+        return best - without
+
     def _of(self, i):
         if i not in self._fits:
             self._fits[i] = self._fit(i)
         return self._fits[i]
 
     def _fit(self, i):
-        """Nats of a trend; electrode (n,) in standard deviations; what one is [ln Z]; amount of the trend;
-        covariance without it."""
+        """Nats of a trend, logarithm of the likelihood without it; electrode (n,) in standard deviations;
+        what one is [ln Z]; amount of the trend; covariance without it, and of the load's part."""
         telling = ~self._silent & (np.arange(self._x.shape[1]) != i)
         others, y, noise = self._x[:, telling], self._x[:, i], self._model.noise
         load = Components(others / noise[telling])
@@ -80,15 +91,15 @@ class Process:
                     K = slope * linear + curved + memory * self._memory
                     nats = _log_likelihood(K, y)
                     if best is None or nats > best[0]:
-                        best = nats, K
-        without, K = best
+                        best = nats, K, slope * linear + curved - base
+        without, K, load = best
         drift = [_log_likelihood(K + a * self._smooth, y) for a in _DRIFT]
-        return max(drift) - without, y, scale, _DRIFT[int(np.argmax(drift))], K
+        return max(drift) - without, without, y, scale, _DRIFT[int(np.argmax(drift))], K, load
 
     def trend(self, i: int) -> Trend:
         """Change of used electrode i over time [ln Z], from the fitted bins alone. Its overall gain is
         predicted block by block, each from the earlier ones."""
-        _, y, scale, amount, K = self._of(i)
+        _, _, y, scale, amount, K, _ = self._of(i)
         both = K + amount * self._smooth
         n = max(2, int((self._time <= self._model.time[self._model.inside][-1]).sum()))
         # the fitted bins choose how fast it changes
