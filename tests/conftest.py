@@ -4,8 +4,10 @@ for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"): 
     os.environ.setdefault(_threads, "1")
 
 # ruff: noqa: E402
+import fcntl
 import gc
 import pathlib
+import re
 import sys
 import time
 import types
@@ -15,6 +17,8 @@ import pytest
 
 REPO = pathlib.Path(__file__).resolve().parents[1]
 sys.path.append(str(REPO / "scripts"))  # which has no biotac_mj in it
+# kernels in which tests spend more time than their compilation takes
+_HOT = re.compile(r"biotac_mj\.(data|geometry|launches|sensor|skin)\b")
 
 
 def pytest_collection():
@@ -41,12 +45,35 @@ def pytest_collection_finish():
 @pytest.fixture(scope="session", autouse=True)
 def default_device():
     """Arrays of the tests are on the CPU, as the package's own are by default, also where CUDA is; tests of
-    CUDA name their device. Kernels of mujoco_warp and of the tests are compiled with the package's flags,
-    which takes a third less time than with Warp's."""
+    CUDA name their device."""
     import warp as wp
 
-    wp.config.cpu_compiler_flags = "-march=native"
     wp.set_device("cpu")
+    _compile_fast(wp)
+
+
+def _compile_fast(wp):
+    """Halves the time of compilation. Kernels of mujoco_warp and of the tests have the package's flags;
+    without CUDA only hot kernels are optimised. A module that another process compiles is waited for."""
+    module, ahead = wp._src.context.Module, sys.modules.get("biotac_mj.batch.ahead")
+    load, compile_ = module.load, module._compile
+    wp.config.cpu_compiler_flags = "-march=native"
+
+    def load_at_level(self, *given, **named):
+        if self.options["optimization_level"] is None and not _HOT.match(self.name):
+            self.options["optimization_level"] = 0
+        return load(self, *given, **named)
+
+    def compile_once(self, *given, **named):
+        with open(pathlib.Path(wp.config.kernel_cache_dir) / f"{self.name}.lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            return compile_(self, *given, **named)
+
+    module._compile = compile_once
+    if not wp.is_cuda_available():
+        module.load = load_at_level
+        if ahead:
+            ahead._LEVEL = 0
 
 
 @pytest.fixture(scope="session")

@@ -10,6 +10,7 @@ import pytest
 import warp as wp
 
 from biotac_mj import batch
+from biotac_mj.batch import ahead
 from biotac_mj.batch.ahead import kernels_of_step
 from biotac_mj.batch.hook import Hook
 from biotac_mj.skin.program import Fork, _noted, launched_by
@@ -49,7 +50,7 @@ def test_all_that_a_step_launches_is_found_and_nothing_runs(monkeypatch):
     assert needed <= {module for module, _ in found}
     convex = [at for at, (module, _) in enumerate(found) if "ccd" in module.name]
     assert convex == list(range(len(convex))) and convex  # they take longest, and come first
-    assert {found[at][0].options["optimization_level"] for at in convex} == {2}
+    assert {found[at][0].options["optimization_level"] for at in convex} == {ahead._LEVEL}
     # compiled once each, for the blocks that it is launched by
     assert [found[at][1] for at in convex] == [m.block_dim.convex_ccd] * len({found[at][0] for at in convex})
     assert np.abs(d.qpos.numpy() - before).max() > 0
