@@ -569,5 +569,5 @@ def test_lagged_friction_bounds_converge_or_slip_goes_on(start, rounds, error, t
         getattr(st, name).fill_(value)
     flags = [wp.zeros(1, dtype=int, device="cpu") for _ in range(2)]
     wp.launch(end_try, 1, [st, flags[0]], device="cpu")
-    wp.launch(choose_increment, 1, [1 / 32, 2500, st, *flags], device="cpu")
+    wp.launch(choose_increment, 1, [1 / 32, 2500, 0, st, *flags], device="cpu")
     assert {name: getattr(st, name).numpy()[0] for name in after} == after

@@ -17,7 +17,7 @@ from ..skin.bodies import BodyMotion
 from .config import TIERS
 from .implicit.kinematics import Kinematics
 from .implicit.metric import assign_slots
-from .implicit.rules import PATIENCE
+from .implicit.rules import EULER, PATIENCE
 from .loads import Touches
 from .setup import (
     CONVERGED,
@@ -53,7 +53,8 @@ class Outcome:
       withheld: fraction of the skin's push on a body that was, for lack of energy.
       energy: (ngroup,) left to each body in the skin at most [J]; None leaves the stored one.
       acting: wrenches (ngroup, 6) that the bodies get, None: those of the skin's last solve.
-      frequency: (ngroup,) angular, at which bodies bounce on the skin [rad/s]; None leaves the stored one.
+      gamma: (ngroup,) Newmark's. frequency: (ngroup,) angular, at which bodies bounce on the skin [rad/s];
+        None leaves the stored one.
     """
 
     rounds: int = 1
@@ -61,6 +62,7 @@ class Outcome:
     withheld: float = 0.0
     energy: np.ndarray | float | None = 0.0
     acting: np.ndarray | None = None
+    gamma: np.ndarray | float = EULER
     frequency: np.ndarray | None = None
 
 

@@ -85,5 +85,5 @@ class Coupled:
         """Tells the instance how the step went."""
         acting = self.instance.seen(self.part("acting"))
         withheld = 1.0 - self.part("push").min(initial=1.0)
-        frequency = self.part("frequency").copy()
-        self.instance.outcome = Outcome(rounds, self.settled, withheld, None, acting, frequency)
+        of_bodies = (self.part(name).copy() for name in ("gamma", "frequency"))
+        self.instance.outcome = Outcome(rounds, self.settled, withheld, None, acting, *of_bodies)
