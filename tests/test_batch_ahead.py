@@ -11,9 +11,9 @@ import warp as wp
 
 from biotac_mj import batch
 from biotac_mj.batch import ahead
-from biotac_mj.batch.ahead import kernels_of_step
+from biotac_mj.batch.ahead import _noted, kernels_of_step, launched_by
 from biotac_mj.batch.hook import Hook
-from biotac_mj.skin.program import Fork, _noted, launched_by
+from biotac_mj.skin.program import Fork
 
 SCENE = """<mujoco><asset><mesh name="tet" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset><worldbody>
 <body><freejoint/><geom type="cylinder" size=".1 .1"/></body>

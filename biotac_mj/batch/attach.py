@@ -35,13 +35,13 @@ from ..skin.contact import meshes, outside
 from ..skin.geoms import shapes_of
 from ..skin.newton.worlds import BLOCK
 from ..skin.per_world import make_room
-from ..skin.program import compile_ahead, finish_compiling, launched_by
+from ..skin.program import compile_ahead, finish_compiling
 from ..skin.rubber.material import Material
 from ..skin.settings import Settings as SkinModelSettings
 from ..skin.settings import read_material
 from ..skin.step import kernels_for_cuda
 from . import clearance, kernels, rest
-from .ahead import kernels_of_step
+from .ahead import kernels_of_step, launched_by
 from .batch import Batch
 from .hook import Hook
 from .implicit import integrator

@@ -12,9 +12,10 @@ from ..coupling.implicit.poses import Bodies
 from ..coupling.implicit.rounds import Marks, Model, make_model
 from ..coupling.touching import Touching
 from ..sensor.acquisition_kernels import place_of
-from ..skin.program import Fork, compile_ahead, finish_compiling, launched_by
+from ..skin.program import Fork, compile_ahead, finish_compiling
 from ..skin.state import GUESS, MEMORY, OUTCOME
 from . import kernels
+from .ahead import launched_by
 from .senses import Senses
 from .skin import BatchSkin, solve_group
 

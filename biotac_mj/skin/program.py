@@ -5,12 +5,11 @@ graph (CUDA 12.4 and later). On the CPU a `Program` records the launches and rep
 more time to pack the arguments of a launch than many of the kernels need to run."""
 
 import concurrent.futures
-import contextlib
 import ctypes
 import functools
 import threading
 import types
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import warp as wp
 
@@ -84,61 +83,27 @@ class Launcher:
         function()
 
 
-class _OfKernels(Launcher):
-    """Calls no function of the host."""
+class _Modules(Launcher):
+    """Launches nothing: collects the modules of all kernels, of every branch."""
+
+    def __init__(self, device: wp.DeviceLike):
+        super().__init__(device)
+        self.found = {}
+
+    def _send(self, kernel, dim, inputs, outputs, block_dim, tiled=False):
+        if _any(dim):
+            self.found[kernel.module, block_dim] = None
+
+    def loop(self, flag, body):
+        body()
+
+    def branch(self, flag, body, otherwise=None):
+        body()
+        if otherwise:
+            otherwise()
 
     def call(self, function):
         pass
-
-
-def launched_by(call: Callable[[], object]) -> list[tuple[wp.Module, int]]:
-    """Modules of the kernels that a call launches, with the threads of their blocks; it launches none."""
-    found = {}
-    with _noted(found):
-        call()
-    return list(found)
-
-
-@contextlib.contextmanager
-def _noted(found: dict) -> Iterator[None]:
-    """This thread's launches are written into `found` instead; loops are gone through once, and both sides of
-    branches."""
-    here = threading.get_ident()
-
-    def note(kernel, dim, *_, block_dim=256, **__):
-        if _any(dim):
-            found[kernel.module, block_dim] = None
-
-    def suggest(kernel, *_, **__):  # the caller launches with the module's number of threads
-        threads = kernel.module.options["block_dim"]
-        note(kernel, 1, block_dim=threads)
-        return threads, 1
-
-    def both(_condition, on_true=None, on_false=None, stream=None, **given):
-        for body in (on_true, on_false):
-            if body is not None:
-                body(**given)
-
-    def once(_condition, while_body=None, stream=None, **given):
-        while_body(**given)
-
-    instead = dict(launch=note, launch_tiled=note, get_suggested_block_size=suggest)
-    instead |= dict(capture_if=both, capture_while=once)
-    real = {name: getattr(wp, name) for name in instead}
-
-    def chosen(name):
-        def call(*given, **named):
-            return (instead if threading.get_ident() == here else real)[name](*given, **named)
-
-        return call
-
-    try:
-        for name in instead:
-            setattr(wp, name, chosen(name))
-        yield
-    finally:
-        for name, function in real.items():
-            setattr(wp, name, function)
 
 
 # future of each module's compilation: to query Warp takes longer than to record a step
@@ -227,8 +192,9 @@ def finish_compiling(futures: Iterable[concurrent.futures.Future] | None = None)
 
 def compile_kernels(device: wp.DeviceLike, record: Callable[[Launcher], None]) -> None:
     """Compiles the kernels that record(launcher) launches, in parallel, and waits for `compile_ahead`."""
-    device = wp.get_device(device)
-    _compile(device, launched_by(lambda: record(_OfKernels(device))))
+    modules = _Modules(device)
+    record(modules)
+    _compile(modules.device, modules.found)
     finish_compiling()
 
 
