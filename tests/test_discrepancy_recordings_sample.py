@@ -2,13 +2,17 @@
 
 import numpy as np
 import pytest
+import yaml
 from grids import covering
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.evidence import further_off
 from biotac_mj.discrepancy.recordings.proof import blocks
 from biotac_mj.discrepancy.recordings.session import Session
+from biotac_mj.effects.sensor_file import write_sensor_file
 from biotac_mj.samples import make_samples
+from biotac_mj.sensor.channels import counts_from_log_impedance, log_impedance
+from biotac_mj.sensor.presets import PER_DEGREE
 
 
 @pytest.fixture(scope="module")
@@ -23,6 +27,25 @@ def test_a_warm_up_lies_within_its_interval(sample):
     (warm,) = diagnose_recording(PlainRecording(*sample, rate=100.0)).findings
     for value, low, high in warm.parameters.values():
         assert low < value < high
+
+
+@pytest.mark.parametrize("alone", (0, 1))
+def test_the_amended_sensor_warms_up_as_reported(sample, alone, tmp_path):
+    """In less time than a tenth of the log; also beside an electrode that drifts by itself."""
+    time = np.arange(len(sample[0])) / 100.0
+    still = sample[0].mean(0) + np.random.default_rng(0).standard_normal(sample[0].shape)
+    counts = counts_from_log_impedance(log_impedance(still) - 0.2 * (1 - np.exp(-time / 3.0))[:, None])
+    counts[:, 4] += alone * np.linspace(0, 150, len(time))
+    diagnosis = diagnose_recording(PlainRecording(np.rint(counts), rate=100.0))
+    (warm,) = [f for f in diagnosis.findings if f.id == "warmup"]
+    write_sensor_file(tmp_path / "own.yaml", diagnosis.sensor())
+    own = yaml.safe_load((tmp_path / "own.yaml").read_text())["sensor"]
+    assert own["warm_time"] == warm.parameters["tau"][0] < 0.1 * time[-1]
+    assert own["warm_up"] * -PER_DEGREE == pytest.approx(warm.parameters["a"][0])
+    share = np.delete(own["warm_share"], 4 if alone else [])
+    np.testing.assert_allclose(share, np.delete(warm.fraction, 4 if alone else []))
+    np.testing.assert_allclose(own["rest"], sample[0].mean(0), atol=30)
+    assert not alone or own["warm_share"][4] > 1.3 * warm.fraction[4]  # both raise counts
 
 
 @pytest.mark.parametrize("with_force, change", covering((False, True), (250.0, -250.0)))

@@ -19,7 +19,7 @@ if typing.TYPE_CHECKING:
 _BACK, _LEAD = 50e-3, 20e-6  # [m] from which an object comes; before first touch, where row 0 is
 _SPEEDS, _HOLDS = (0.5e-3, 20e-3), (0.2, 10.0)  # [m/s], [s], both uniform in their logarithm
 _LONGEST = 60.0  # hold, in times that a press takes
-_SLIDE = 2e-3  # [m], at most, of half of the contacts
+_SLIDE, _SHALLOW = 2e-3, 1e-4  # [m]: at most, of half of the contacts; less deep than any contact
 _LEAST = 0.15  # of the depth that the bounds allow
 _ROWS = {"press": 6, "hold": 5, "slide": 5, "release": 5}
 _SAFE = 0.9  # of the largest force: effects may add to the base model's
@@ -30,7 +30,8 @@ class Bounds:
     """Limits of a contact.
 
     Attributes:
-      force: largest [N]. depth: largest [m]. reach: from and to along the finger, tip at -x [m]. around: the
+      force: largest [N]. depth: largest [m]. reach: from and to along the finger, tip at -x, of
+        the whole path [m]. around: the
         largest angle around the finger, either way, 0 on the pad's midline; tilt: the largest angle between
         press and the skin's inward normal [rad]. tools: names, as for `biotac press`.
     """
@@ -108,18 +109,25 @@ def drawn(
         travel = first_touch(Placed(tool, 1), points, begin[None], mat[None], heading[None])[0]
         if not np.isfinite(travel):
             continue
+        # the whole path is within reach: so deep, and from there so far aside
+        at, steep = begin + travel * heading, heading[0]
+        room = np.array(bounds.reach) - at[0]
+        depth = min(bounds.depth, room[int(steep > 0)] / steep if steep else np.inf)
+        ways = (room - np.sort([-_LEAD * steep, depth * steep])) / np.sqrt(1 - steep**2)
+        if depth < _SHALLOW or ways[0] > 0 or ways[1] < 0:
+            continue
         contact = Contact(
             tool,
             float(x),
             float(angle),
             tilt,
-            float(bounds.depth),
+            float(depth),
             _between(_SPEEDS, u[5]),
             _between(_HOLDS, u[6]),
-            float(np.round(_SLIDE * (4 * u[7] - 3), 5)) if u[7] > 0.5 else 0.0,
+            float(np.fix(1e5 * np.clip(_SLIDE * (4 * u[7] - 3), *ways)) / 1e5) if u[7] > 0.5 else 0.0,
             2 if u[8] > 0.75 else 1,
         )
-        found.append((contact, begin + travel * heading, mat, _LEAST + (1 - _LEAST) * u[9]))
+        found.append((contact, at, mat, _LEAST + (1 - _LEAST) * u[9]))
     if not found:
         raise ValueError("no tool meets the skin within these bounds: give another --reach, or a larger one")
     # straight presses to the bound give force over depth
@@ -134,7 +142,7 @@ def drawn(
         load = sim.modulus * np.linalg.norm(one["force"], axis=1)
         deepest = int(np.argmax(probe.depth)) + 1
         far = np.interp(_SAFE * bounds.force, np.maximum.accumulate(load[:deepest]), probe.depth[:deepest])
-        if far > 1e-4:
+        if far > _SHALLOW:
             deep = float(fraction * far)
             # rows of one trajectory lie no further apart than a hundred others
             hold = min(contact.hold, _LONGEST * deep / contact.speed)
