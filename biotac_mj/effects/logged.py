@@ -183,7 +183,7 @@ _LEVELS = {
 
 
 class WarmUpInLog(WarmUp, SharedLevel):
-    fits, requires, detector, drifts = _LOG, frozenset(), "shared", True
+    fits, requires, detector, drifts = _LOG, frozenset({"time"}), "shared", True
     params = {"a": Param("ln Z", -1.5, 1.5, WarmUp.params["a"].source), "tau": Param("s", 1, 1e5, "minutes")}
     confusable = WarmUp.confusable | _LEVELS
 
@@ -207,7 +207,7 @@ class WarmUpInLog(WarmUp, SharedLevel):
 
 
 class FluidLossInLog(FluidLoss, SharedLevel):
-    fits, requires, detector, drifts = _LOG, frozenset({"sign"}), "loss", True
+    fits, requires, detector, drifts = _LOG, frozenset({"sign", "time"}), "loss", True
     rises = True
     params = FluidLoss.params | {
         "rate": Param("1/h", 0.0, 60.0, "0-15 % a day from permeability; a leak empties it in a minute", 0.2)

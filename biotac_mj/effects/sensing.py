@@ -96,7 +96,7 @@ class FluidLoss(Effect):
 
 class Thermal(Effect):
     id, name, stage = "thermal", "temperature dependence of conductivity", "T"
-    fits, requires, detector = frozenset({"poses", "log"}), frozenset({"tdc"}), "shared"
+    fits, requires, detector = frozenset({"poses", "log"}), frozenset({"tdc", "time"}), "shared"
     physics = "ln Z = ... - alpha (T - T0), T from TDC"
     params = {
         "alpha": Param(

@@ -38,7 +38,8 @@ class Model:
       used (c,) electrode numbers; time (m,) [s]; value (m, c) ln Z about the mean of the rows fitted;
       inside (m,) bool, bins fitted; slope (c,) [counts]; noise (c,) of a bin [ln Z]; dimensions of the load,
       0 of an unloaded sensor; activity (c,) RMS change within windows [ln Z]; moved: whether by as much as a
-      load; given: Gaussian of electrodes and products; whole (m, c + products).
+      load; parted: whether nothing moved, or for long enough to separate load and drift; given: Gaussian of
+      electrodes and products; whole (m, c + products).
     """
 
     def __init__(self, counts: np.ndarray, good: np.ndarray, fit: np.ndarray, rate: float, fresh: float):
@@ -79,13 +80,15 @@ class Model:
         span = max(4, span)
         x = self.value
         centred = x - x.mean(1, keepdims=True)
-        within = _within(x[self.inside], span, self.known[self.inside])
+        long = bool(self.inside.sum() * self.period >= LEAST)
+        within = _within(x[self.inside], span, self.known[self.inside], 0.96 if long else 1.0)
         self.activity = np.sqrt((within**2).mean(0))
         # dimensions that move by more than noise and rounding do
         lively = np.linalg.eigvalsh((within / self.noise).T @ (within / self.noise) / len(within))[::-1]
         self.dimensions = int(min((lively > 9).sum(), _DIMENSIONS, np.sqrt(len(within) / 12)))
         # a load moves electrodes by tens of counts within seconds; noise, filtered or not, does not
         self.moved = bool(np.median(np.sort(self.activity * self.slope)[-6:]) >= _MOVED)
+        self.parted = long or not self.moved
         if not (self.parted and self.moved):
             self.dimensions = 0
         q = self.dimensions
@@ -98,11 +101,6 @@ class Model:
         within = _within(self.whole[self.inside], span, self.known[self.inside])
         floor = np.concatenate([self.noise**2, np.full(products.shape[1], _FLOOR)])
         self.given = Conditional(within.T @ within / len(within), floor, len(self.used))
-
-    @property
-    def parted(self) -> bool:
-        """Whether the fitted rows are long enough to separate load and drift."""
-        return bool(self.inside.sum() * self.period >= LEAST)
 
     def residual(self, value: np.ndarray | None = None) -> np.ndarray:
         """(m, c) residual of every electrode given the others [ln Z]; unloaded: less the common change.
@@ -146,10 +144,10 @@ class Model:
         return cells.mean(1), self.time[: w * size].reshape(w, size).mean(1)
 
 
-def _within(x, span, known):
-    """(rows, q) less the mean and slope of every window of span rows; the liveliest windows are left out, for
-    a step within one is a change of the sensor and not of the load, and those with holes (m, c) while enough
-    are left."""
+def _within(x, span, known, usual=0.96):
+    """(rows, q) less the mean and slope of every window of span rows; all but a usual fraction of them, the
+    liveliest, are left out, for a step within one is a change of the sensor and not of the load, and those
+    with holes (m, c) while enough are left."""
     span = min(span, len(x))  # a part may be shorter than a window
     k = len(x) // span
     cells = x[: k * span].reshape(k, span, -1)
@@ -157,7 +155,7 @@ def _within(x, span, known):
     cells = (cells - basis @ (basis.T @ cells)) * np.sqrt(span / (span - 2))
     energy = (cells / np.maximum(np.sqrt((cells**2).mean((0, 1))), 1e-12)) ** 2
     energy = energy.mean(1).max(1)
-    keep = energy <= np.quantile(energy, 0.96)
+    keep = energy <= np.quantile(energy, usual)
     whole = known[: k * span].reshape(k, -1).all(1)
     if (keep & whole).sum() * span > 2 * x.shape[1]:
         keep &= whole

@@ -83,7 +83,7 @@ def _kind(session, low):
     m = session.model()
     if session.loaded:
         return "loaded"
-    if m.moved and not m.parted and low > _SWINGS:
+    if not m.parted and low > _SWINGS:
         return "short"
     return "moving" if low > _LIVELY else "still"
 

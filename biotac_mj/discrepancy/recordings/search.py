@@ -253,6 +253,8 @@ def _explains(one, other):
 def _late(session):
     """Effects of single electrodes or all that begin in the held-out part: searched in the whole record,
     less what was found; nothing is left to confirm them."""
+    if not session.model().parted:
+        return []
     r = session.recording
     begin = r.time[~session.fit][0]
     whole = Session(r, np.ones(len(r), bool), session.findings, session.unnamed)

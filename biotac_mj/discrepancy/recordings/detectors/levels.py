@@ -33,10 +33,10 @@ _MOSTLY = 0.6  # least fraction of a trend that a multiple of the common one exp
 
 def levels(session: Session, rejected: set) -> Candidate | None:
     """The strongest trend over time that one electrode or all have, none of those refused. Series that were
-    put together have none: their levels differ by what is touched."""
-    if session.recording.joints:
-        return None
+    put together have none, nor touches too short to be told from drift: levels differ by what is touched."""
     m = session.model()
+    if session.recording.joints or not m.parted:
+        return None
     number = len(m.used)
     everyone = np.ones(number)
     common, time = m.levels(m.shared(everyone))
