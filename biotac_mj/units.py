@@ -27,13 +27,13 @@ def read_quantity(name: str, value: object, kind: str) -> object:
     """
     if not isinstance(value, str):
         return value
-    found, units = _TEXT.fullmatch(value), UNITS[kind]
+    plain = value.replace("\u00b5", "u").replace("\u03bc", "u")  # the micro sign, the letter mu
+    found, units = _TEXT.fullmatch(plain), UNITS[kind]
     if not found or found[2] not in ("", *units):
         usual = list(units)[1]
         raise ValueError(
             f"{name} is {short_repr(value)}: give a number with a unit, as in 2{usual} (of "
-            f"{', '.join(units)}), or "
-            f"a plain number in {SI[kind]}"
+            f"{', '.join(units)}), or a plain number in {SI[kind]}"
         )
     return float(found[1]) * units.get(found[2], 1.0)
 

@@ -87,7 +87,7 @@ def draw_section(axes, record, step, title, what=None):
 def draw_skin(record, path):
     figure, axes = sheet(2)
     draw_section(axes[0], record, 0, "at rest")
-    draw_section(axes[1], record, record.deepest, f"pressed {1e3 * record.depth.max():.1f} mm", "moved [mm]")
+    draw_section(axes[1], record, record.peak, f"pressed {1e3 * record.depth.max():.1f} mm", "moved [mm]")
     figure.savefig(path, dpi=110)
 
 
@@ -103,7 +103,7 @@ def draw_liquid(wet, dry, path):
     inner = np.unique(geometry.inner_face)
     out = geometry.vert[inner] * [0, 1, 1]
     out /= np.linalg.norm(out, axis=1, keepdims=True)
-    bulge = 1e3 * ((np.asarray(wet.vert_xpos[wet.deepest], float) - geometry.vert)[inner] * out).sum(1)
+    bulge = 1e3 * ((np.asarray(wet.vert_xpos[wet.peak], float) - geometry.vert)[inner] * out).sum(1)
     limit = np.abs(bulge).max()
     place = unroll(geometry.vert[inner])
     dots = axes[1].scatter(*place.T, c=bulge, cmap="RdBu", vmin=-limit, vmax=limit, s=12)
@@ -115,7 +115,7 @@ def draw_liquid(wet, dry, path):
 def draw_film(record, path):
     import trimesh
 
-    geometry, step = record.geometry, record.deepest
+    geometry, step = record.geometry, record.peak
     figure, axes = sheet(2, width=10.0)
     inner = np.unique(geometry.inner_face)
     inner = inner[np.abs(np.arctan2(geometry.vert[inner, 2], -geometry.vert[inner, 1])) < 2.0]
@@ -137,7 +137,7 @@ def draw_tiers(full, condensed, path):
     for record, name, style in ((full, "full", "-"), (condensed, "condensed", "--")):
         depth, change = 1e3 * record.depth, record.electrode_change
         axes[0].plot(depth, np.linalg.norm(record.force, axis=1), style, color=SKIN, label=name)
-        most = np.argsort(-np.abs(full.electrode_change[full.deepest]))[:3]
+        most = np.argsort(-np.abs(full.electrode_change[full.peak]))[:3]
         for e, color in zip(most, (SKIN, WARM, DARK)):
             axes[1].plot(depth, change[:, e], style, color=color, label=f"E{e + 1}, {name}")
     axes[0].set(xlabel="depth [mm]", ylabel="force [N]", title="The same press in both tiers")

@@ -158,6 +158,8 @@ def test_units_mean_the_same_on_the_command_line_and_in_python():
     texts = PressOptions(location=args.location, depth="1.5mm", slide="2mm", speed="10mm/s", hold="0.005")
     plain = PressOptions(location=(-14e-3, -np.pi / 6), depth=1.5e-3, slide=2e-3, speed=0.01, hold=5e-3)
     assert PressOptions(location="-14mm -30deg") == PressOptions(location=plain.location)
+    for micro in ("um", "\u00b5m", "\u03bcm"):  # the micro sign and the letter mu
+        assert PressOptions(depth=f"1500{micro}").depth == pytest.approx(1.5e-3)
     assert PressOptions(location="-14mm") == PressOptions(location=(-14e-3, 0.0))
     for name in ("location", "depth", "slide", "speed", "hold"):
         assert getattr(texts, name) == pytest.approx(getattr(plain, name)), name

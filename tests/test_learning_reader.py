@@ -253,7 +253,8 @@ def test_a_force_of_noise_is_not_offered_for_use(tmp_path, capsys):
     write(tmp_path / "rec.h5", [dataclasses.replace(one, object_pos=None, object_quat=None)])
     assert cli.main(train) == 0
     said = capsys.readouterr().out
-    assert "use it with `biotac learn predict" in said and "note: fy: no better than the mean" in said
+    assert "; use fx, fz with `biotac learn predict" in said and "use it" not in said
+    assert "note: fy: no better than the mean: do not use these" in said
     y = one.force[:, 1]  # white noise
     assert abs(np.corrcoef(y[1:], y[:-1])[0, 1]) < 0.1
     assert Reader.load(out).meta["useless"] == ["fy"]
@@ -264,7 +265,7 @@ def test_a_force_of_noise_is_not_offered_for_use(tmp_path, capsys):
     write(tmp_path / "rec.h5", [dataclasses.replace(one, force=noise, object_pos=None, object_quat=None)])
     assert cli.main(train) == 0
     said = capsys.readouterr().out
-    assert "note: fx, fy, fz: no better than the mean" in said and "use it with" not in said
+    assert "note: fx, fy, fz: no better than the mean" in said and "learn predict" not in said
     write(tmp_path / "rec.h5", [dataclasses.replace(one, force=np.ones_like(noise))])
     assert cli.main(train) == 2
     assert "synthetic: the force never changes, so that it cannot be learned" in capsys.readouterr().err

@@ -130,7 +130,7 @@ def test_a_press_on_a_pad_without_electrodes_shows_what_it_has(flat, tmp_path):
         warnings.simplefilter("error")
         report.write_picture(record, tmp_path / "press.png")
     axes = Figure().add_subplot()
-    report.draw_pressure(axes, record, record.deepest)
+    report.draw_pressure(axes, record, record.peak)
     assert axes.get_xlim() == pytest.approx((-10, 10)) and axes.get_ylim() == pytest.approx((-7, 7))
 
 

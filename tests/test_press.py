@@ -389,6 +389,24 @@ def test_the_table_has_force_channels_and_failures(synthetic_press):
     assert f"electrodes  E{first + 1} " in text
 
 
+def test_what_is_shown_is_the_moment_of_the_peak_force(springs):
+    """A sphere that slides off the skin: readings, picture and MuJoCo's render are of one step in contact."""
+
+    def seen(model, data):
+        return data.time, data.mocap_pos[0].copy()
+
+    far = dict(slide=30e-3, slide_direction=(-1, 0, 0), speed=0.05, timestep=1e-2)
+    record, (time, pos) = press(PressOptions(**springs | far), render=seen, progress=False)
+    force = np.linalg.norm(record.force, axis=1)
+    assert force[-1] == 0 and force[record.peak] > 0.999 * force.max() > 0
+    assert record.peak < len(force) - 1 and time == pytest.approx(record.time[record.peak])
+    np.testing.assert_allclose(pos, record.indenter_pos[record.peak], atol=1e-12)
+    counts = record.counts.copy()
+    counts[record.peak, 4] += 77
+    text = report.table(dataclasses.replace(record, counts=counts))
+    assert "electrodes  E5 +77" in text and f"N at {1e3 * record.depth[record.peak]:.3f} mm" in text
+
+
 def colors(image):
     """How many distinct colours, in steps of 1/16, cover at least 20 pixels."""
     _, count = np.unique((image[..., :3] * 16).astype(int).reshape(-1, 3), axis=0, return_counts=True)

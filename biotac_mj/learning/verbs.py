@@ -312,9 +312,10 @@ def _save_reader(args, reader, scores):
     )
     _say_errors(scores)
     _note_useless(reader.meta)
-    outputs = {name for target in scores["targets"] for name in TARGETS[target]}
-    use = f"; use it with `biotac learn predict {args.out} RECORDING`"
-    print(f"written: {args.out}{use if outputs - set(reader.meta['useless']) else ''}")
+    useless = reader.meta["useless"]
+    good = ", ".join(n for target in scores["targets"] for n in TARGETS[target] if n not in useless)
+    use = f"; use {good if useless else 'it'} with `biotac learn predict {args.out} RECORDING`"
+    print(f"written: {args.out}{use if good else ''}")
 
 
 def _say_errors(scores):
@@ -329,7 +330,7 @@ def _say_errors(scores):
 
 def _note_useless(meta):
     if useless := meta.get("useless"):
-        print(f"  note: {', '.join(useless)}: no better than the mean: do not use it, record more touches")
+        print(f"  note: {', '.join(useless)}: no better than the mean: do not use these, record more touches")
 
 
 def _add_tare(v):
@@ -343,8 +344,7 @@ def _add_predict(verbs, verb):
         "predict",
         _predict,
         "Predict from a recording: force, contact position and electrodes with intervals and novelty; "
-        "or, "
-        "with inverse weights, deformation and contact of the skin.",
+        "or, with inverse weights, deformation and contact of the skin.",
     )
     v.add_argument(
         "model",

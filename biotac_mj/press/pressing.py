@@ -1,4 +1,4 @@
-"""Simulates one press of an indenter into a BioTac with `mj_step`, and renders its end."""
+"""Simulates one press of an indenter into a BioTac with `mj_step`, and renders its peak."""
 
 import dataclasses
 import time
@@ -13,7 +13,7 @@ import tqdm
 from .. import plugin
 from .indenter import make_indenter
 from .path import LEAD, PressOptions, plan_path
-from .record import PressRecord
+from .record import NEAR_PEAK, PressRecord
 from .scene import build_scene
 
 
@@ -50,8 +50,8 @@ def press(
 
     Args:
       options: options of the press.
-      render: called with (model, data) at the end, such as `press.render`; its result is returned beside the
-        record.
+      render: called with (model, data) of the step `record.peak`, such as `press.render`; its result is
+        returned beside the record.
       progress: whether to show a progress bar.
 
     Warns if nothing was touched.
@@ -83,10 +83,11 @@ def press(
     with plugin.explained():
         model = spec.compile()
         data = mujoco.MjData(model)
-    rows, picture, seconds = [], None, 0.0
-    last = len(path.depth) - 1
-    for step in tqdm.trange(last + 1, desc="press", unit="step", disable=not progress or None, leave=False):
-        travel = np.array([path.depth[step], path.slid[step]])
+    rows, picture, seconds, largest = [], None, 0.0, 0.0
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    kept = np.empty(mujoco.mj_stateSize(model, kind))  # at the peak
+    ways = np.column_stack([path.depth, path.slid])
+    for travel in tqdm.tqdm(ways, "press", unit="step", disable=not progress or None, leave=False):
         begin = time.perf_counter()
         if options.two_way:
             data.ctrl[:] = (travel + [LEAD, 0])[: model.nu]
@@ -106,7 +107,12 @@ def press(
                 *_read(handle, data),
             )
         )
+        largest = max(largest, force := np.linalg.norm(rows[-1][5]))
+        if force >= NEAR_PEAK * largest:
+            mujoco.mj_getState(model, data, kept, kind)
     if render is not None:
+        mujoco.mj_setState(model, data, kept, kind)
+        mujoco.mj_forward(model, data)
         picture = render(model, data)
     times, depth, position, xpos, pressure, force, counts, pac, nonconverged = (
         np.array(column) for column in zip(*rows)

@@ -12,6 +12,7 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..versions import versions
 
 _BEFORE, _AFTER = ("time_s", "depth_m", "force_x_N", "force_y_N", "force_z_N"), ("nonconverged", "tier")
+NEAR_PEAK = 0.999  # of the largest force: a pause at it is the peak to its end, where channels have followed
 
 
 @dataclasses.dataclass
@@ -76,9 +77,10 @@ class PressRecord:
         return self.counts[:, :n] - self.counts[0, :n]
 
     @property
-    def deepest(self) -> int:
-        """Index of the last saved step at the greatest depth, which pictures show."""
-        return int(np.flatnonzero(self.depth >= self.depth.max() - 1e-9)[-1])
+    def peak(self) -> int:
+        """Index of the last saved step within 0.1 % of the largest force, which summary and pictures show."""
+        force = np.linalg.norm(self.force, axis=1)
+        return int(np.flatnonzero(force >= NEAR_PEAK * force.max())[-1])
 
 
 def write_readings(record: PressRecord, path: pathlib.Path | str) -> None:

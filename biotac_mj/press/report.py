@@ -183,16 +183,15 @@ def draw_surface(axes: Axes, record: PressRecord, step: int) -> None:
 
 
 def write_picture(record: PressRecord, path: pathlib.Path | str, render: np.ndarray | None = None) -> None:
-    """Writes press.png: rendering, electrode map, force over depth, electrode traces; of a pad without
-    electrodes pressure in their place.
+    """Writes press.png: rendering and map of electrodes, or of pressure, at the peak; force and traces.
 
     Args:
       record: the press.
       path: of the picture; its suffix gives the format.
-      render: (height, width, 3) uint8 of the step `record.deepest` from MuJoCo; None: matplotlib draws the
+      render: (height, width, 3) uint8 of the step `record.peak` from MuJoCo; None: matplotlib draws the
         surfaces.
     """
-    step = record.deepest
+    step = record.peak
     figure = Figure(figsize=(13, 9), layout="constrained")
     FigureCanvasAgg(figure)
     if render is None:
@@ -202,7 +201,7 @@ def write_picture(record: PressRecord, path: pathlib.Path | str, render: np.ndar
         axes = figure.add_subplot(2, 2, 1)
         axes.imshow(render)
         axes.set_axis_off()
-    axes.set_title(f"Skin at {1e3 * record.depth[step]:.2f} mm")
+    axes.set_title(f"Peak force: skin at {1e3 * record.depth[step]:.2f} mm, {record.time[step]:.3f} s")
     draw_force(figure.add_subplot(2, 2, 3), record)
     design = record.geometry.design
     if design.nelectrode:
@@ -220,22 +219,20 @@ def write_picture(record: PressRecord, path: pathlib.Path | str, render: np.ndar
 def table(record: PressRecord, files: tuple | list = ()) -> str:
     """Summary of a press in a few lines of text."""
     force = np.linalg.norm(record.force, axis=1)
-    change = record.electrode_change[record.deepest]
+    change = record.electrode_change[record.peak]
     pdc = record.counts[:, len(change)]
     order = np.argsort(-np.abs(change))[:5]
     felt = [
-        ("electrodes", "  ".join(f"E{i + 1} {change[i]:+.0f}" for i in order) + "  counts"),
-        ("PDC", f"{pdc[record.deepest] - pdc[0]:+.0f} counts"),
+        ("electrodes", "  ".join(f"E{i + 1} {change[i]:+.0f}" for i in order) + "  counts at the peak"),
+        ("PDC", f"{pdc[record.peak] - pdc[0]:+.0f} counts at the peak"),
     ]
     if not len(change):
-        felt = [("skin moved", f"{_outer_motion(record, record.deepest)[1].max():.3f} mm at most")]
+        felt = [("skin moved", f"{_outer_motion(record, record.peak)[1].max():.3f} mm at most, at the peak")]
         if record.contact_pressure is not None:
-            felt.append(
-                ("pressure", f"{1e-3 * record.contact_pressure[record.deepest].max():.1f} kPa at most")
-            )
+            felt.append(("pressure", f"{1e-3 * record.contact_pressure[record.peak].max():.1f} kPa at most"))
     rows = [
         ("depth", f"{1e3 * record.depth.max():.3f} mm"),
-        ("peak force", f"{force.max():.3f} N at {1e3 * record.depth[force.argmax()]:.3f} mm"),
+        ("peak force", f"{force.max():.3f} N at {1e3 * record.depth[record.peak]:.3f} mm"),
         *felt,
         ("steps", f"{len(record.time)} saved, {int(record.nonconverged[-1])} did not converge"),
         ("steps took", f"{record.seconds:.2f} s"),
