@@ -32,7 +32,7 @@ from biotac_mj.learning.training.arrays import load_arrays  # noqa: E402
 from biotac_mj.learning.training.config import LearningConfig  # noqa: E402
 from biotac_mj.learning.training.experiment import train_all  # noqa: E402
 from biotac_mj.learning.training.features import mirror_order  # noqa: E402
-from biotac_mj.learning.training.few_shot import evaluate_new_sensor, fit_gains, fit_mixing  # noqa: E402
+from biotac_mj.learning.training.few_shot import evaluate_new_sensor, fit_gains, fit_mixing, simplest_mixing  # noqa: E402
 from biotac_mj.learning.training.fitting import Checkpoints  # noqa: E402
 from biotac_mj.learning.training.inverse import contact_centre, log_change_of, patch_overlap  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
@@ -348,6 +348,26 @@ def test_few_touches_bring_another_sensors_gains(weights, tmp_path):
         rest = data["measured_counts"][data.start][:, :19]
     np.testing.assert_allclose(sensor.rest, rest[data.labelled].mean(0), atol=1e-3)
     assert np.shape(sensor.mixing) == (19, 19)
+    assert json.loads((tmp_path / "new.json").read_text())["adapted"] == "mixing"
+    assert 0.5 < found["largest_force"] < 1.5  # deepest of the touches in mm, as make_set has it
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_new_sensor_is_changed_no_more_than_it_differs(seed):
+    """By nothing, gains (or a mixing as near to them) or cross-talk; and what only weak touches show, a rise
+    that ends at 60 counts, does not change strong ones."""
+    from biotac_mj.data.generation.synthetic_sensor import SensorVariation
+
+    rng, mixing = np.random.default_rng(seed), SensorVariation.draw(seed).mixing
+    owner = np.repeat(np.arange(40), 12)
+    x = (rng.normal(size=(40, 19)) * np.exp(rng.normal(5, 0.8, (40, 1))))[owner]
+    x *= rng.uniform(0, 1, (480, 1)) * (1 + 0.2 * rng.normal(size=x.shape))
+    noise, gain = 4 * rng.normal(size=x.shape), np.diag(np.diag(mixing))
+    for matrix, names in ((np.eye(19), ["no change"]), (gain, ["gains", "mixing"]), (mixing, ["mixing"])):
+        got, fitted = simplest_mixing(x, x @ matrix.T + noise, owner)
+        assert got in names and np.abs(fitted - matrix).max() < 0.02
+    got, fitted = simplest_mixing(x, x + 60 * np.tanh(x / 60) + noise, owner)
+    assert got == "no change" and np.array_equal(fitted, np.eye(19))
 
 
 @pytest.mark.parametrize("touches", [5, 20])

@@ -15,6 +15,7 @@ torch = pytest.importorskip("torch", reason="needs torch: pip install biotac_mj[
 pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
 
 # ruff: noqa: E402
+import biotac_mj
 from biotac_mj.cli import main
 from biotac_mj.cli.names import TASKS as NAMES
 from biotac_mj.tasks.batched import (
@@ -22,6 +23,7 @@ from biotac_mj.tasks.batched import (
     TASKS,
     FollowEdge,
     RollRod,
+    TaskSettings,
     gymnasium_env,
     make,
     rsl_rl_env,
@@ -367,13 +369,14 @@ def test_gymnasium_gets_the_last_observation_of_an_episode():
     assert not seen[1][8:12].any() and seen[0][8:12].all()
     final = told["final_info"]
     assert final["error"][1] == told["error"][1] and final["_error"].tolist() == [False, True]
+    assert {n: final[n].dtype for n in ("success", "error")} == {"success": bool, "error": np.float32}
 
 
 def test_learned_touch_needs_sensors_with_a_network():
     env = make("follow_edge", 1, device="cpu")
     with pytest.raises(ValueError, match="observe is 'learned': .*observe='learned'"):
         env.observe("learned")
-    with pytest.raises(ValueError, match="observe is 'learned'"):
+    with pytest.raises(ValueError, match="observe is 'learned': .*without signal="):
         make("follow_edge", 1, device="cpu", observe="learned", signal="physics")
 
 
@@ -543,8 +546,28 @@ def test_what_only_a_task_has_is_refused_elsewhere(capsys):
     assert main(["play", "press.h5", "--episodes", "3"]) == 2
     said = "--episodes is of one task, and press.h5 is none: pass one of roll_rod, insert_peg"
     assert said in capsys.readouterr().err
+    assert main(["play", "follow_edge", "--policy", "electrodes", "--episodes", "1"]) == 2
+    assert "electrodes is a policy of roll_rod: play that" in capsys.readouterr().err
     with pytest.raises(FileNotFoundError, match="no policy of juggle comes .* give --policy script"):
         find_policy("juggle")
+
+
+@pytest.mark.parametrize("more", [["--render", "x.gif"], ["--window"], ["--port", "8123"]])
+def test_a_task_is_played_in_one_way(more, capsys):
+    assert main(["play", "follow_edge", "--policy", "random", "--episodes", "1", *more]) == 2
+    assert f"episodes and {more[0][2:]} are given" in capsys.readouterr().err
+    assert main(["play", "follow_edge", "--policy", "random", "--json", *more]) == 2
+    assert "json is of scores: give episodes too" in capsys.readouterr().err
+
+
+def test_settings_and_skin_of_others_are_no_tasks():
+    for other in (biotac_mj.coupling.settings.Settings(), TaskSettings(), {"decisions": 3}):
+        with pytest.raises(
+            ValueError, match=r"settings are .*pass the task's, dataclasses.replace\(FollowEdge.settings"
+        ):
+            make("follow_edge", 1, device="cpu", settings=other)
+    with pytest.raises(ValueError, match="skin is of a BioTac SP.*: .*leave it out"):
+        make("follow_edge", 1, device="cpu", skin="biotac_sp/coarse")
 
 
 def test_a_misspelt_keyword_is_answered_with_those_of_the_task():

@@ -339,9 +339,8 @@ def _slots(mjm, m, d, touching, prefix):
     if without:
         raise ValueError(
             f"there is no room for two-way coupling of the BioTac {prefix!r} with {', '.join(without)}: add "
-            "it after the objects, with "
-            "coupling='two-way', or name the geoms that may touch with add(geoms=[...]) and "
-            "attach(geoms=[...])"
+            "it after the objects, with coupling='two-way', or name the geoms that may touch with "
+            "add(geoms=[...]) and attach(geoms=[...])"
         )
     rows = sum(
         6 if t == mujoco.mjtEq.mjEQ_WELD else 3 if t == mujoco.mjtEq.mjEQ_CONNECT else 1 for t in mjm.eq_type

@@ -46,8 +46,7 @@ def stand_in(
     if answer.nonconverged[0]:
         raise ValueError(
             f"{answer.nonconverged[0]} of {answer.steps} reference steps of {indentation.name!r} did not "
-            "converge: "
-            "press less deep, or take more samples"
+            "converge: press less deep, or take more samples"
         )
     force = answer.force[0] + noise * np.random.default_rng(seed).standard_normal(answer.force[0].shape)
     return dataclasses.replace(

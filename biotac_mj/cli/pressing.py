@@ -230,7 +230,7 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
     add_skin(verb)
     verb.set_defaults(skin=None, tier=None, material=None)
     _add_hand(verb)
-    verb.add_argument("--port", type=whole(1, 65535), default=8080, help="port of the page")
+    verb.add_argument("--port", type=whole(1, 65535), help="port of the page (default: 8080)")
     verb.add_argument(
         "--policy",
         metavar="FILE",
@@ -273,7 +273,7 @@ def _play(args):
             pass
     from ..view import view
 
-    more = dict(hand=args.hand, mount=args.mount, recording=args.recording or None, port=args.port)
+    more = dict(hand=args.hand, mount=args.mount, recording=args.recording or None, port=args.port or 8080)
     quick = {"skin": "coarse", "tier": "condensed", "material": "default"}  # a press takes a second or two
     shown = {name: value for name, value in _displayed_skin(args).items() if value is not None}
     view(web=True, **more, **quick | shown)

@@ -25,11 +25,9 @@ def _add_train(verbs, verb):
         "train",
         _train,
         "Train on SOURCE. Into one FILE.safetensors: of a recording with force, or of a set, a model that "
-        "reads "
-        "force and place from electrodes; of a folder of trained networks the best one that predicts "
-        "electrodes, "
-        "for attach(signal=FILE). Into a folder: all networks on a labelled set, continued if it was "
-        "interrupted.",
+        "reads force and place from electrodes; of a folder of trained networks the best one that predicts "
+        "electrodes, for attach(signal=FILE). Into a folder: all networks on a labelled set, continued if it "
+        "was interrupted.",
     )
     v.add_argument("source", metavar="SOURCE", help="a recording, a set, or a folder of trained networks")
     v.add_argument(
@@ -148,17 +146,9 @@ def _train_all(args):
         settings = {"members": 1} | settings
     if args.steps:
         settings |= {"steps": args.steps, "paper_steps": 4 * args.steps, "mesh_steps": 4 * args.steps}
-    train_all(
-        args.source,
-        args.out,
-        args.seeds,
-        args.splits,
-        LearningConfig(**settings),
-        args.device,
-        args.paper,
-        progress=not args.quiet,
-        ray=args.ray,
-    )
+    on = args.source, args.out, args.seeds, args.splits
+    how = dict(progress=not args.quiet, ray=args.ray)
+    train_all(*on, LearningConfig(**settings), args.device, args.paper, **how)
     print(f"written: {args.out}; judge it with `biotac learn judge {args.out}`")
 
 
@@ -250,7 +240,9 @@ def _judge(args):
     elif recorded:
         _judge_recording(args)
     elif args.source:
-        _judge_networks(args)
+        from .report import evaluate_models, table
+
+        print(table(evaluate_models(args.source, args.json)))
     else:
         _judge_new_sensor(args)
 
@@ -268,7 +260,11 @@ def _judge_new_sensor(args):
     for name, found in table.items():
         print(f"  {name:<30}" + "".join(f"{found[k]:8.1f}" if k in found else f"{'':8}" for k in counts))
     if args.sensor:
-        print(f"written: {args.sensor}, the film with a mixing; use it with attach(effects={args.sensor!r})")
+        print(
+            f"written: {args.sensor}, the film with {one['adapted']}: of no change, gains and mixing the "
+            "simplest that, fitted to the weaker half of the touches, is not significantly worse on the "
+            f"stronger, up to {one['largest_force']:.2g} N; use it with attach(effects={args.sensor!r})"
+        )
 
 
 def _judge_model(args, recorded):
@@ -293,12 +289,6 @@ def _judge_model(args, recorded):
         print(f"  note: {note}")
     write_json(args.json, scores)
     print(f"written: {args.json}")
-
-
-def _judge_networks(args):
-    from .report import evaluate_models, table
-
-    print(table(evaluate_models(args.source, args.json)))
 
 
 def _save_reader(args, reader, scores):
@@ -439,8 +429,8 @@ def _judge_recording(args):
     print(f"  {'':<28}{'train RMS':>10}{'test RMS':>10}{'median row':>12}")
     for name, row in table["models"].items():
         print(
-            "  "
-            f"{name:<28}{row['train']['rms']:>10.2f}{row['test']['rms']:>10.2f}{row['test']['median_row']:>12.2f}"
+            f"  {name:<28}{row['train']['rms']:>10.2f}{row['test']['rms']:>10.2f}"
+            f"{row['test']['median_row']:>12.2f}"
         )
     print(f"  noise of the sensor, at most {table['noise_rms']:.2f}")
     if "force_regression" in result:

@@ -23,8 +23,7 @@ def record_topics(topics: list[str], seconds: float, object_name: str | None = N
     if listen is None:
         raise ValueError(
             "--topic needs ROS' Python library, rclpy or rospy: source your ROS installation's setup.bash "
-            "first, or "
-            "record a bag and give it to `biotac recording import`"
+            "first, or record a bag and give it to `biotac recording import`"
         )
     found = {name: Topic(name) for name in topics}
     listen(found, seconds)

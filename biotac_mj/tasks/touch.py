@@ -159,8 +159,7 @@ def check_fitted_on(name: str, stored: dict, config: "Config") -> None:
             f"the estimator {name!r} was fitted on a BioTac with {was}: how far its estimates are off is "
             "unknown. Fit it for this one with "
             f"`python scripts/fit_estimators.py --estimators {name} --skin SKIN --tier TIER --material "
-            "MATERIAL --out FILE`, "
-            "then make_controller(task, env, calibration=FILE)",
+            "MATERIAL --out FILE`, then make_controller(task, env, calibration=FILE)",
             CalibrationWarning,
             stacklevel=3,
         )

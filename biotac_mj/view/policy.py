@@ -32,7 +32,7 @@ def play_task(
     json: bool = False,
     render: pathlib.Path | str | None = None,
     window: bool = False,
-    port: int = 8080,
+    port: int | None = None,
     device: str = "cpu",
     seed: int = 0,
     hand: pathlib.Path | str | None = None,
@@ -45,7 +45,7 @@ def play_task(
         that uses the true state; "random".
       episodes: number of episodes to score, in parallel worlds; None: show episodes one after the other.
       json: print scores as JSON. render: GIF of episodes. window: MuJoCo's viewer instead of the page at
-      `port`.
+      `port` (8080).
       seed: of initial states. hand: for the rod's task.
       biotac: settings of the BioTacs, as `batch.attach` has them, in place of those that the policy learned
         with; its card is not compared then.
@@ -54,10 +54,16 @@ def play_task(
       The scores of `episodes`.
 
     Raises:
-      ValueError: the task has no hand.
+      ValueError: the task has no hand, or of episodes, render, window and port several are given.
     """
     if hand and "hand" not in inspect.signature(TASKS[task]).parameters:
         raise ValueError(f"hand is not of {task}: leave it out")
+    ways = dict(episodes=episodes, render=render, window=window, port=port)
+    given = [name for name, value in ways.items() if value]
+    if len(given) > 1:
+        raise ValueError(f"{' and '.join(given)} are given: a task is played in one of these ways")
+    if json and not episodes:
+        raise ValueError("json is of scores: give episodes too, or leave it out")
     _, act, card = acting(task, policy, device)
     biotac = dict(biotac or {})
     if "options" in biotac:
@@ -75,7 +81,7 @@ def play_task(
     elif window:
         show_window(env, act)
     else:
-        show_page(env, act, port)
+        show_page(env, act, port or 8080)
     return None
 
 
@@ -194,14 +200,9 @@ def show_page(env: BatchTask, act: Callable, port: int = 8080, seconds: float = 
             body = data.body(f"{prefix}core")
             pdc = float(data.sensor(f"{prefix}pdc").data[0])
             tare = float(env.rest_counts[0, i, len(rest)])
-            moments[finger] = Moment(
-                batch.vert_xpos[0][mirror.node],
-                mirror.change(finger),
-                pdc - tare if tare else 0.0,
-                float(env.force[0, i]),
-                body.xpos.copy(),
-                body.xquat.copy(),
-            )
+            shown = batch.vert_xpos[0][mirror.node], mirror.change(finger), pdc - tare if tare else 0.0
+            pose = body.xpos.copy(), body.xquat.copy()
+            moments[finger] = Moment(*shown, float(env.force[0, i]), *pose)
         page.update(time, moments)
         time += each
         if time > seconds:

@@ -266,6 +266,5 @@ def _check_numbers(value, label):
         row, column = bad[0]
         raise ValueError(
             f"{label}: {len(bad)} values are not finite, the first in row {row + 1}, column {column + 1}: a "
-            "gap cannot be guessed; "
-            "cut the recording there or log it again"
+            "gap cannot be guessed; cut the recording there or log it again"
         )

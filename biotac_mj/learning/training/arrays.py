@@ -70,8 +70,7 @@ class Arrays:
         if not len(rows):
             raise ValueError(
                 f"one split has no {'labelled ' if labelled else ''}time steps: more interactions "
-                "with measured counts are "
-                "needed (biotac data generate --labelled), or another object"
+                "with measured counts are needed (biotac data generate --labelled), or another object"
             )
         return rows
 

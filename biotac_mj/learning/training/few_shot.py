@@ -10,7 +10,7 @@ import torch
 from ...effects.sensor_file import SensorFile, write_sensor_file
 from ...files import write_json
 from ...sensor.channels import FULL_SCALE
-from ..protocol import interaction_errors
+from ..protocol import interaction_errors, is_better
 from ..weights import load_forward
 from .arrays import load_arrays
 from .local import counts_change
@@ -68,6 +68,29 @@ def _ridge(square, product, penalty, prior):
     return begin + np.linalg.solve(square + size * np.eye(k), (product - begin @ square).T).T
 
 
+def simplest_mixing(predicted: np.ndarray, measured: np.ndarray, owner: np.ndarray) -> tuple[str, np.ndarray]:
+    """The first of "no change", "gains" and "mixing" that none after it is significantly better than, and its
+    matrix (nelectrode, nelectrode) fitted to all touches; arguments as for `fit_mixing`.
+
+    They are compared on the stronger half of the touches, fitted to the weaker half: a sensor is used in
+    contacts beyond its touches, where coefficients that these leave open do harm.
+    """
+    fits = {
+        "no change": lambda x, y, owner: np.eye(y.shape[1]),
+        "gains": lambda x, y, owner: np.diag(fit_gains(x, y)),
+        "mixing": fit_mixing,
+    }
+    touches, size = interaction_errors(np.zeros_like(measured), measured, owner)
+    aside = np.isin(owner, touches[np.argsort(size)[len(size) // 2 :]])
+    best = least = None
+    for name, fit in fits.items():
+        matrix = fit(predicted[~aside], measured[~aside], owner[~aside])
+        error = predicted[aside] @ matrix.T - measured[aside]
+        if least is None or is_better(error, least, owner[aside]):
+            best, least = name, error
+    return best, fits[best](predicted, measured, owner)
+
+
 def _common_gain(square, product):
     return np.full(len(square), product.sum() / max(square.sum(), 1e-9))
 
@@ -90,11 +113,11 @@ def evaluate_new_sensor(
     Args:
       path: labelled set of that sensor. weights: forward model. out: JSON. draws: random choices of the k
         touches, averaged. Every model is evaluated on the same other touches.
-      sensor: YAML file for `attach(effects=)` with the sensor's rest counts, and the mixing of the film
-        fitted to all touches.
+      sensor: YAML file for `attach(effects=)`: the sensor's rest counts, the film's `simplest_mixing`.
 
     Returns:
-      "median_rms_counts": {model: {k: error}}; for k = 0 the model is unchanged.
+      "median_rms_counts": {model: {k: error}}; for k = 0 the model is unchanged. With `sensor`
+      also "adapted", what `simplest_mixing` chose, and "largest_force" [N] of the touches.
 
     Raises:
       ValueError: fewer than 10 labelled touches.
@@ -108,11 +131,8 @@ def evaluate_new_sensor(
             "at least 10 are needed to adapt on some and judge on others"
         )
     rows = arrays.rows(labelled, labelled=True)
-    tare, truth, owner = (
-        arrays.tare[rows],
-        arrays.change(rows).cpu().numpy(),
-        arrays.owner[rows].cpu().numpy(),
-    )
+    tare, truth = arrays.tare[rows], arrays.change(rows).cpu().numpy()
+    owner = arrays.owner[rows].cpu().numpy()
     by_network = torch.cat([model.log_change(arrays.field[r].float()) for r in rows.split(512)])
     film, network = (counts_change(z, tare).cpu().numpy() for z in (arrays.film_change()[rows], by_network))
     inputs = {"film": film, "weights": network, "film and weights": np.concatenate([film, network], 1)}
@@ -147,9 +167,11 @@ def evaluate_new_sensor(
         "interactions": len(labelled),
         "median_rms_counts": table,
     }
-    write_json(out, result)
     if sensor is not None:
-        rest = arrays.counts[arrays.first[rows].unique()].mean(0).tolist()
-        own = {"rest": rest, "mixing": fit_mixing(film, truth, owner).tolist()}
+        own = {"rest": arrays.counts[arrays.first[rows].unique()].mean(0).tolist()}
+        result["adapted"], mixing = simplest_mixing(film, truth, owner)
+        result["largest_force"] = float(arrays.force[rows].float().sum(1).max())
+        own |= {"mixing": mixing.tolist()} if result["adapted"] != "no change" else {}
         write_sensor_file(sensor, SensorFile({"sensor": own, "signal": "physics"}, [], {}))
+    write_json(out, result)
     return result

@@ -71,8 +71,7 @@ class Material:
         if not -1 < self.poissons_ratio < 0.5:
             raise ValueError(
                 f"Poisson's ratio {self.poissons_ratio} is outside (-1, 0.5): an incompressible rubber "
-                "needs nu below 0.5, "
-                "the liquid's volume constraint does the rest"
+                "needs nu below 0.5, the liquid's volume constraint does the rest"
             )
         if self.poissons_ratio > 0.5 - _LEAST_DIFFERENCE:
             raise ValueError(

@@ -98,8 +98,8 @@ def skrl_env(env: BatchTask) -> object:
 
 def gymnasium_env(env: BatchTask) -> "gymnasium.vector.VectorEnv":
     """A `gymnasium.vector.VectorEnv` with NumPy arrays: observations (num_envs, n), body and touch. Worlds
-    that end begin anew in the same step, whose info has their "final_obs" and "final_info". One seed is for
-    all worlds, and all are reset at once; it can be neither copied nor pickled, like the batch.
+    that end begin anew in a step; its info has "success" and "error" of what was before, and theirs again in
+    "final_info", with "final_obs". One seed is for all, reset at once; it is neither copied nor pickled.
 
     Raises:
       ModuleNotFoundError: Gymnasium is not there: pip install gymnasium.
@@ -133,7 +133,7 @@ def gymnasium_env(env: BatchTask) -> "gymnasium.vector.VectorEnv":
                 final = np.full(env.num_envs, None, object)
                 for world in np.flatnonzero(done):
                     final[world] = seen[world]
-                told = {name: np.where(done, value, 0) for name, value in info.items()}
+                told = {name: np.where(done, value, np.zeros_like(value)) for name, value in info.items()}
                 told |= {f"_{name}": done for name in info}
                 info |= {"final_obs": final, "final_info": told, "_final_obs": done, "_final_info": done}
             return (_policy(observations).cpu().numpy(), *(x.cpu().numpy() for x in others), info)

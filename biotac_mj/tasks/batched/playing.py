@@ -25,7 +25,7 @@ def find_policy(task: str, policy: pathlib.Path | str | None = None) -> pathlib.
     path.
 
     Raises:
-      FileNotFoundError: None, and the package ships no policy of this task.
+      FileNotFoundError: the package ships no policy of this task, or this one of another.
     """
     name = task if policy is None else f"{task}-{policy}"
     assets = pathlib.Path(str(importlib.resources.files("biotac_mj.assets")))
@@ -33,6 +33,9 @@ def find_policy(task: str, policy: pathlib.Path | str | None = None) -> pathlib.
     if path.is_file():
         return path
     if policy is not None:
+        others = [name for name in TASKS if (path.parent / f"{name}-{policy}.safetensors").is_file()]
+        if others:
+            raise FileNotFoundError(f"{policy} is a policy of {', '.join(others)}: play that")
         return pathlib.Path(policy)
     raise FileNotFoundError(
         f"no policy of {task} comes with this version: give --policy script, or --policy FILE that "

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from ...fields import as_whole, check_choice
+from ...short_repr import short_repr
 from ...view.offscreen import stage
 from .bank import Bank
 from .touch import OBSERVE, Touch, as_deviations
@@ -110,6 +111,9 @@ class BatchTask(abc.ABC):
         self.history = as_whole("history", history, 1)
         self.model_error = as_deviations(model_error)
         self.cfg = s = self.settings if settings is None else settings
+        if not isinstance(s, type(self.settings)):
+            own = f"dataclasses.replace({type(self).__name__}.settings, ...)"
+            raise ValueError(f"settings are {short_repr(s)}: pass the task's, {own}")
         where = wp.get_device(device)
         self.device = f"cuda:{where.ordinal}" if where.is_cuda else "cpu"
         self.max_episode_length = s.decisions

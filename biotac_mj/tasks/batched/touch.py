@@ -10,6 +10,7 @@ import warp as wp
 from ...batch import Batch
 from ...fields import as_numbers, check_choice
 from ...geometry import load_skin
+from ...geometry.design import BIOTAC
 from ...sensor.film import BatchFilm
 from ...sensor.weighted import WeightedElectrodes
 from ...short_repr import short_repr
@@ -37,7 +38,7 @@ class Touch:
 
     Args:
       mjm: the MjModel. sensordata: (nworld, nsensordata) tensor of it.
-      batches: {prefix: Batch}. skin: of all of them.
+      batches: {prefix: Batch}. skin: of all of them, a BioTac's.
     """
 
     def __init__(
@@ -50,6 +51,8 @@ class Touch:
         self._split = [len(a) for a in address[0]]
         self._kind = tensor(np.repeat(np.arange(len(_CHANNELS)), self._split))
         geometry = load_skin(skin)
+        if geometry.design != BIOTAC:
+            raise ValueError(f"skin is of a {geometry.design.title}: give a BioTac's or leave it out")
         each = np.eye(len(geometry.electrode_pos))
         self._pos = tensor(geometry.electrode_pos, dtype=torch.float32)
         # the formula is linear in how far counts fall
@@ -113,7 +116,7 @@ class Touch:
         Raises:
           ValueError: another choice, or "learned" where electrodes are the film's.
         """
-        more = "; learned needs make(..., observe='learned')" if self._film else ""
+        more = "; learned needs make(..., observe='learned'), without signal='physics'" if self._film else ""
         check_choice("observe is", choice, OBSERVE[:-1] if self._film else OBSERVE, more)
         electrodes, pdc, pac = changes.split(self._split, dim=3)
         if choice == "none":
