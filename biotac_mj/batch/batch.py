@@ -257,7 +257,7 @@ class Batch(Skins):
         """Finds the energy of skins in worlds that take part, after `evaluate`; marks those in which a step
         of more damping is to be tried."""
         out = [self._greedy, damped.struct]
-        self._settle(energy.find_energy, taking_part, [self._last, self._solid], out)
+        self._settle(energy.find_energy, taking_part, [self._last, self.skin.reason, self._solid], out)
 
     def restrain(self, d: "mjw.Data", worlds: Marks, going: Marks) -> None:
         """Takes the push on bodies that have not the energy for it, after `find_energy` and `evaluate`, and

@@ -3,6 +3,7 @@
 import numpy as np
 
 from ...skin.bodies import BodyMotion
+from ...skin.newton.worlds import CONVERGED, NOT_CONVERGED
 from ..instance import Instance, Outcome
 from ..setup import LINEAR
 from ..structs import DataView
@@ -46,7 +47,8 @@ class Coupled:
         if self.result is None:
             still = self.bodies.start < self.bodies.stop and off < STILL and of_all < TOLERANCE
             self._still = still and not self.part("placed").any()
-            self.result = self.instance.stay() if self._still else None
+            if self._still:
+                self._take(self.instance.stay())
         self.off = np.inf if self.result is None else off
 
     def solve(self) -> None:
@@ -70,9 +72,16 @@ class Coupled:
         if self._still and self.result is None and result.converged:
             wrong, wrench = np.abs(result.wrench - self.part("acting")), np.abs(result.wrench)
             self.instance.stays = bool(wrong.max() < FORETOLD * wrench.max())
-        self.result, self.may_act = result, result.converged and self._cost < _MOST
+        self._take(result)
+        self.may_act = result.converged and self._cost < _MOST
         for name, value in zip(LINEAR, result.model):
             self.part(name)[:] = value
+
+    def _take(self, result):
+        self.result = result
+        self._arrays.reason[self.number] = (
+            CONVERGED if result is not None and result.converged else NOT_CONVERGED
+        )
 
     def _core_motion(self):
         if not self.instance.inertial:

@@ -45,6 +45,13 @@ def most_energy(r: Rounds, force: real, solid: Solid, w: int):
 
 
 @wp.func
+def _is_unknown(r: Rounds, g: int, reason: int, w: int):
+    """Whether a body began in the skin, of which no equilibrium has been found since."""
+    began_inside = wp.isinf(r.left[g, w]) or (r.placed[g, w] == 1 and r.inside[w] == 1)
+    return began_inside and reason != CONVERGED
+
+
+@wp.func
 def draws(r: Rounds, w: int):
     """Energy that the bodies of a skin lack together, and that they may give to each other [J]."""
     lacks = real(0.0)
@@ -68,6 +75,7 @@ def find_energy(
     # In:
     taking_part: wp.array(dtype=int),
     last: Model,
+    reason: wp.array(dtype=int),
     solid: Solid,
     # In and out:
     r: Rounds,
@@ -77,7 +85,10 @@ def find_energy(
 ):
     """Finds the energy that each body has in the skin: that of the last step, and the work of what has moved
     the body since. Skins that would give more are greedy while they have not yet made backward Euler's step,
-    which gives less: their worlds are marked."""
+    which gives less: their worlds are marked.
+
+    How much was put into a skin that a body begins in is not known before an equilibrium is found: until then
+    the skin may brake the body and gives it nothing."""
     w = wp.tid()
     greedy_out[w] = 0
     if taking_part[w] == 0:
@@ -93,6 +104,8 @@ def find_energy(
         store = _in_store(r.left[g, w], before, now, most)
         if r.placed[g, w] == 1:  # placing a body in a skin does the work of its push; outside it does none
             store = most_energy(r, wp.where(r.inside[w] == 1, pushes, real(0.0)), solid, w)
+        if _is_unknown(r, g, reason[w], w) and solid.inertial == 0:
+            store = real(0.0)
         r.most[g, w] = most
         r.store[g, w] = store
     undamped = int(0)
@@ -184,8 +197,7 @@ def conclude(
             left += passed * _lacking(r.store[g, w], gets) / both[0]
             left -= passed * _spared(r.left[g, w], r.store[g, w], gets) / both[1]
         left = wp.min(left, r.most[g, w])
-        unknown = wp.isinf(r.left[g, w]) or (r.placed[g, w] == 1 and r.inside[w] == 1)
-        if unknown and reason[w] != CONVERGED:  # what was put in is not known before an equilibrium is found
+        if _is_unknown(r, g, reason[w], w):
             left = real(wp.inf)
         if wp.isnan(gets):  # the engine has lost the body
             left = real(0.0)

@@ -12,7 +12,6 @@ import warp as wp
 
 from ...geometry.rigid_warp import LEVER
 from ...kernels import set_fields
-from ...skin.newton.worlds import CONVERGED, NOT_CONVERGED
 from ...skin.types import mat66, real, vec6
 from ..instance import Instance
 from ..setup import LINEAR, MODEL, STARTED
@@ -150,7 +149,7 @@ class SkinGroup:
             self._row(stage) for stage in stages
         )
         self.find_energy = self._marking(
-            energy.find_energy, lambda s: (s.last, s.solid, s.rounds, s.flags["greedy"])
+            energy.find_energy, lambda s: (s.last, s.flags["reason"], s.solid, s.rounds, s.flags["greedy"])
         )
         none = wp.zeros((1, 0), dtype=float, device="cpu")
         self.restrain = self._marking(
@@ -318,9 +317,6 @@ class SkinGroup:
         travel = self.jacobian @ moved
         error = np.abs((travel - self.arrays.travel) * _SCALE)
         self.arrays.travel[:] = travel
-        self.arrays.reason[:] = NOT_CONVERGED
-        for skin in self.skins:
-            self.arrays.reason[skin.number] = CONVERGED if skin.result.converged else NOT_CONVERGED
         self._conclude()
         for skin in self.skins:
             outcome = skin.instance.outcome
