@@ -20,6 +20,7 @@ from biotac_mj.discrepancy.recordings.detectors.levels import levels
 from biotac_mj.discrepancy.recordings.detectors.order import slipped
 from biotac_mj.discrepancy.recordings.detectors.process import process
 from biotac_mj.discrepancy.recordings.detectors.trends import Trend, sharp, trends
+from biotac_mj.discrepancy.recordings.proof import prove
 from biotac_mj.discrepancy.recordings.recording import as_plain
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.discrepancy.report.files import write_report
@@ -629,7 +630,7 @@ def test_a_straight_drift_is_no_long_warm_up():
 
 @pytest.mark.parametrize("seconds", (5, 9))
 def test_short_touches_have_no_warm_up_and_still_logs_do(seconds):
-    """What the report says cannot be told from touches is not named; of the fitted 3 s none is left out."""
+    """What the report says cannot be told from touches is not named; one touch in one window is enough."""
 
     def said(counts, rng, climb=40):
         counts = counts + climb * np.linspace(0, 1, len(counts))[:, None]
@@ -641,8 +642,21 @@ def test_short_touches_have_no_warm_up_and_still_logs_do(seconds):
     found, short = said(*unloaded(seconds=seconds))
     assert {"warmup", "fluidloss"} & set(found) and not short
     once, rng = unloaded(seconds=seconds)
-    once[len(once) // 6 : len(once) // 4] -= rng.uniform(20, 200, 19)
+    once[len(once) // 8 : len(once) // 6] -= rng.uniform(20, 200, 19)
     assert said(once, rng, climb=0) == ([], True)
+
+
+@pytest.mark.parametrize("back", (-1.0, 0.5))
+def test_what_a_report_prints_of_a_trend_decides_on_it(back):
+    """A warm-up that goes on in the first quarter held out, and then turns back, or by half."""
+    e, rng = unloaded()
+    time = np.linspace(0, 1, len(e))
+    climb = np.interp(time, [0, 0.7, 0.78, 1], [0, 1, back, back])[:, None]
+    session = session_of(noisy(e + 100 * climb, rng))
+    found = levels(session, set())
+    session.accept(found)
+    prove(session, found)
+    assert found.verified and found.gap.gained and "first quarter" in found.gap.name
 
 
 @pytest.mark.slow  # quick: what a summary says it cannot know

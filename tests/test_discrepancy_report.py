@@ -180,8 +180,11 @@ def test_the_headline_says_the_largest_gap_and_what_closes_it():
 def test_a_headline_says_where_nothing_is_gained():
     same = Gap("counts", 2.031, 2.028, 1.0, "the electrodes")
     force = Gap("N", 0.3, 0.2, 0.2, "the force")
-    said = dataclasses.replace(VERDICT, gap={"electrodes": same}).headline
+    unproved = [dataclasses.replace(WARM, gap=None, confirmed=None)]
+    said = dataclasses.replace(VERDICT, gap={"electrodes": same}, effects=unproved).headline
     assert said.endswith("; warm-up (or temperature) gains nothing there.") and "added" not in said
+    said = dataclasses.replace(VERDICT, gap={"electrodes": same}).headline  # what confirms it is said
+    assert said.endswith("takes level of all electrodes from 10 to 2 counts instead.") and "added" not in said
     said = dataclasses.replace(VERDICT, gap={"electrodes": same, "force": force}).headline
     assert said.startswith("The largest gap is in the electrodes, 2.03 counts RMS where 1 counts are noise")
     assert said.endswith("; warm-up (or temperature) takes the force from 0.3 to 0.2 N instead.")

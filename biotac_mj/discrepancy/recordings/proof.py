@@ -39,7 +39,7 @@ def prove(session: Session, finding: Candidate) -> None:
         finding.written = not further_off(*blocks(without, session))
     finding.gap = gap
     if gap is not None and finding.verified is None:
-        finding.verified = gap.after < gap.before
+        finding.verified = gap.gained
 
 
 def _rms(x):
@@ -58,34 +58,32 @@ def _aside_from(session):
 
 
 def _counts(session, without, finding):
-    """RMS of the finding's electrodes about their prediction from the others, or for a common effect about
-    their own level."""
+    """RMS, in the first quarter of the held-out rows, of the finding's electrodes about their prediction from
+    the others, or for a common effect about their own level."""
     m, aside = _aside(session)
     bare = without.model()
     mine = np.flatnonzero(np.isin(m.used, finding.channels))
     if len(bare.used) != len(m.used) or not len(mine):
         return None
-    # how a trend goes on is less sure the later: its first quarter may confirm what the whole does not
-    first = aside & (np.cumsum(aside) <= aside.sum() / 4)
-    noise, out = m.noise * m.slope, []
+    # how a trend goes on is less sure the later
+    first, noise, out = aside & (np.cumsum(aside) <= aside.sum() / 4), m.noise * m.slope, []
     for value in (bare.value + bare.mean - m.mean, m.value):
         if finding.of_all:
             series = m.shared(np.ones(len(m.used)), value)[:, None] * m.slope.mean()
         else:
             series = m.residual(value)[:, mine] * m.slope[mine]
-        out += [_rms(series[rows]) for rows in (aside, first)]
+        out.append(_rms(series[first]))
     if finding.of_all:
         what, floor = "the electrodes' common part about its level", _rms(noise) / np.sqrt(len(noise))
     else:
         what, floor = "electrode against what the others say", _rms(noise[mine])
-    before, early_before, after, early_after = out
-    better = after < before or early_after < early_before
+    gap = Gap("counts", *out, floor, f"RMS of {what} in the part fitted, over the first quarter held out")
     # beside a load the level against the others wanders by itself
-    if not better and (finding.under_load or finding.features.get("turns", 0.0) > _TURNS):
+    if not gap.gained and (finding.under_load or finding.features.get("turns", 0.0) > _TURNS):
         return None
     if not finding.sudden:  # its evidence is in its own rows
-        finding.verified = better
-    return Gap("counts", before, after, floor, f"RMS of {what} in the part fitted")
+        finding.verified = gap.gained
+    return gap
 
 
 def _samples(session, finding):

@@ -350,7 +350,9 @@ class Verdict:
             return f"{text}; no known cause is sure enough for a name."
         if not added:
             return f"{text}; {what} would explain what was fitted, and held-out data contradict it."
-        other = max(self.gap.values(), key=lambda one: one.taken / max(one.before, 1e-12))
+        own = [f.gap for f in self.effects if f.gap is not None and f.confirmed]
+        each = [one for one in self.gap.values() if one.gained] or own or [gap]
+        other = max(each, key=lambda one: one.taken / max(one.before, 1e-12))
         if gap.gained:
             said = f"with {what} added it is {gap.after:.3g} {gap.unit}"
         elif other.gained:
