@@ -5,7 +5,7 @@ import pytest
 import yaml
 from grids import covering
 
-from biotac_mj.discrepancy import PlainRecording, diagnose_recording
+from biotac_mj.discrepancy import PlainRecording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import further_off
 from biotac_mj.discrepancy.recordings.proof import blocks
 from biotac_mj.discrepancy.recordings.session import Session
@@ -48,6 +48,18 @@ def test_the_amended_sensor_warms_up_as_reported(sample, alone, tmp_path):
     assert not alone or own["warm_share"][4] > 1.3 * warm.fraction[4]  # both raise counts
 
 
+def test_an_electrode_without_numbers_is_drawn_and_said(sample, tmp_path):
+    counts = sample[0].copy()
+    counts[:, 6] = np.nan
+    names = ",".join(f"e{k + 1}" for k in range(19))
+    np.savetxt(tmp_path / "log.csv", counts, "%g", delimiter=",", header=names, comments="")
+    diagnosis = diagnose_recording(read_recording(tmp_path / "log.csv", rate=100.0))
+    assert any("e7: no number in most rows: taken for dead" in line for line in diagnosis.warnings)
+    titles = [one.title for (one,) in diagnosis.panels()]
+    assert titles[0].startswith("e7: ") and "stuck channel" in titles[0]
+    assert len({title.split(":")[0] for title in titles}) == len(titles) == 4  # others warm up
+
+
 @pytest.mark.parametrize("with_force, change", covering((False, True), (250.0, -250.0)))
 def test_a_slow_common_change_is_of_the_session(sample, change, with_force):
     """In counts, of a sensor that is warm by then: not told from what goes on in ln Z, and no step."""
@@ -71,7 +83,7 @@ def test_what_makes_held_out_rows_worse_is_not_written(sample):
     for gap in diagnosis.gap.values():
         assert gap.after <= gap.before * 1.01
     for finding in diagnosis.findings:
-        assert finding.written or finding.id in " ".join(diagnosis.amended)
+        assert finding.written or finding.kind.name in " ".join(diagnosis.amended)
     assert "warm_up" not in diagnosis.sensor().base["sensor"]
 
 

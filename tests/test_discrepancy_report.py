@@ -169,8 +169,8 @@ def test_the_headline_says_the_largest_gap_and_what_closes_it():
     assert "held-out data contradict it" in doubtful.headline and "added" not in doubtful.headline
     assert "no known cause" in dataclasses.replace(VERDICT, effects=[]).headline
     there = dataclasses.replace(VERDICT, lead="force").headline
-    assert there.startswith("The largest gap is in the force, 0.3 N RMS; warm-up (or temperature) takes ")
-    assert there.endswith("takes the electrodes from 10 to 4 counts instead.")
+    assert there.startswith("The largest gap is in the force, 0.3 N RMS; with warm-up (or temperature) ")
+    assert there.endswith("(or temperature) 10 counts in the electrodes become 4.")
     agree = dataclasses.replace(VERDICT, effects=[], significant=False)
     assert "agree within" not in agree.headline and "may be off by" in agree.headline
     small = {"electrodes": Gap("counts", 2.03, 2.03, 2.0, "the electrodes")}
@@ -180,14 +180,16 @@ def test_the_headline_says_the_largest_gap_and_what_closes_it():
 def test_a_headline_says_where_nothing_is_gained():
     same = Gap("counts", 2.031, 2.028, 1.0, "the electrodes")
     force = Gap("N", 0.3, 0.2, 0.2, "the force")
-    unproved = [dataclasses.replace(WARM, gap=None, confirmed=None)]
-    said = dataclasses.replace(VERDICT, gap={"electrodes": same}, effects=unproved).headline
-    assert said.endswith("; warm-up (or temperature) gains nothing there.") and "added" not in said
+    unproved = dataclasses.replace(VERDICT, effects=[dataclasses.replace(WARM, gap=None, confirmed=None)])
+    said = dataclasses.replace(unproved, gap={"electrodes": same}).headline
+    assert said.endswith("; found beside it, with no share in it: warm-up (or temperature).")
+    little = Gap("N", 0.3, 0.297, 0.2, "the force")
+    assert dataclasses.replace(unproved, gap={"electrodes": same, "force": little}).headline == said
     said = dataclasses.replace(VERDICT, gap={"electrodes": same}).headline  # what confirms it is said
-    assert said.endswith("takes level of all electrodes from 10 to 2 counts instead.") and "added" not in said
+    assert said.endswith("10 counts in level of all electrodes become 2.") and "added" not in said
     said = dataclasses.replace(VERDICT, gap={"electrodes": same, "force": force}).headline
     assert said.startswith("The largest gap is in the electrodes, 2.03 counts RMS where 1 counts are noise")
-    assert said.endswith("; warm-up (or temperature) takes the force from 0.3 to 0.2 N instead.")
+    assert said.endswith("; with warm-up (or temperature) 0.3 N in the force become 0.2.")
 
 
 def test_the_summary_has_effect_proof_gap_and_what_is_unknown():
@@ -223,6 +225,14 @@ def test_curves_have_a_panel_for_each_channel():
     figure = plots.curves([panels[:3], panels[3:]])
     assert [ax.get_title() for ax in figure.axes] == [one.title for one in panels]
     assert [len(ax.lines) for ax in figure.axes] == [2] * 6
+    figure.canvas.draw()
+    assert all(any(t.get_text() and t.get_visible() for t in ax.get_yticklabels()) for ax in figure.axes)
+
+
+def test_a_channel_without_measurement_says_so_beside_its_name():
+    gap = Gap("counts", 3.0, 2.0, 0.5, "a", ("e1", "e2"), (3.0, math.nan), (2.0, math.nan))
+    (ax,) = plots.channels([gap]).axes
+    assert [(t.get_text().strip(), t.get_position()[0]) for t in ax.texts] == [("no measurement", 1)]
 
 
 def test_a_report_opens_with_the_channel_that_is_most_off():

@@ -386,7 +386,7 @@ def test_an_amended_sensor_says_what_it_leaves_out():
     diagnosis = diagnose_recording(PlainRecording(np.rint(counts)))
     file, left = diagnosis.sensor(), running(diagnosis.session)[1]
     assert "hum" in {f.id for f in diagnosis.findings} and "hum" in left
-    assert "not in sensor_amended.yaml: hum" in summary(diagnosis)
+    assert "not in sensor_amended.yaml: mains hum" in summary(diagnosis)
     own = file.base["sensor"]
     assert own["warm_up"] * own["warm_share"][4] == pytest.approx(0.0, abs=0.6)
     drift = own["warm_up"] * np.delete(own["warm_share"], 4) * (1 - np.exp(-90 / own["warm_time"]))

@@ -70,6 +70,15 @@ def test_a_picture_of_a_plan_has_room_for_long_reasons(tmp_path):
         write_plan(one, tmp_path / "plan.csv")
 
 
+def test_contacts_at_one_place_have_one_label(tmp_path, monkeypatch):
+    said, (first, second) = [], plan().contacts
+    t = second.trajectory
+    second = dataclasses.replace(second, trajectory=dataclasses.replace(t, pos=t.pos + 1e-3))
+    monkeypatch.setattr("matplotlib.axes.Axes.annotate", lambda ax, text, at, **_: said.append(text))
+    write_plan(Plan([first, second, first], {}, []), tmp_path / "plan.csv")
+    assert said == ["1, 3", "2"]
+
+
 def test_a_laboratory_reads_the_plan_that_was_written(lab, tmp_path):
     wanted = plan()
     write_plan(wanted, tmp_path / "plan.csv")

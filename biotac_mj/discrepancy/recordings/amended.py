@@ -50,8 +50,8 @@ def _warming(session, rest):
     drifts = [f for f in session.findings if f.kind.drifts and f.written]
     if not drifts:
         return rest, {}
-    rows = np.linspace(0, session.fit.sum() - 1, 200).astype(int)
-    time, warm = session.recording.time, next((f for f in drifts if f.id == "warmup"), None)
+    rows, time = np.linspace(0, session.fit.sum() - 1, 200).astype(int), session.recording.time
+    warm = next((f for f in drifts if f.id == "warmup"), None)
 
     def course(found):
         counts = np.tile(rest, (len(time), 1))

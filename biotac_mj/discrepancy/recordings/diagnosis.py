@@ -55,13 +55,14 @@ class RecordingDiagnosis(Verdict):
         return self.session.weak
 
     def panels(self) -> list[list[Panel]]:
-        """Some channels that the effects change most on the held-out part, or those with the largest
+        """Electrodes that never measure and those that the effects change most, or those with the largest
         residual; beside each baseline and load as the other electrodes predict them."""
         s, r, m = self.session, self.recording, self.session.model()
         said = counts_from_log_impedance(m.value - (m.residual() if m.dimensions else m.value) + m.mean)
         effect = r.electrodes - s.filled()
-        change = np.sqrt((effect[~s.fit] ** 2).mean(0))
-        some = [int(k) for k in np.argsort(-change)[:_PANELS] if change[k] > 0.2 * change.max()]
+        change = np.sqrt((effect**2).mean(0))
+        some = np.flatnonzero(s.masked.all(0)).tolist()
+        some += [int(k) for k in np.argsort(-change) if change[k] > 0.2 * change.max() and k not in some]
         if not self.findings:
             some = [int(c["channel"][1:]) - 1 for c in self.rest.cells][:2]
         measured, effect = (
@@ -69,15 +70,11 @@ class RecordingDiagnosis(Verdict):
             for x in (r.electrodes, effect)
         )
         aside, out = (r.time[~s.fit][0], r.time[-1]), []
-        for k in some or [0]:
+        for k in some[:_PANELS] or [0]:
             simulated = said[:, np.flatnonzero(m.used == k)[0]] if k in m.used else None
             amended = None if simulated is None else simulated + effect[:, k]
-            names = dict.fromkeys(
-                f.kind.name
-                for f in self.findings
-                if k in f.channels and (f.correct is not None or f.mask is not None)
-            )
-            title = f"e{k + 1}" + (": " + "; ".join(names) if names else "")
+            acting = [f for f in self.findings if k in f.channels and (f.correct or f.mask is not None)]
+            title = ": ".join(filter(None, (f"e{k + 1}", "; ".join({f.kind.name: 0 for f in acting}))))
             out.append([Panel(title, "counts", m.time, measured[:, k], simulated, amended, aside)])
         return out
 
@@ -168,8 +165,8 @@ def _amended(session):
     ]
     if left := running(session)[1]:
         lines.append(
-            f"not in sensor_amended.yaml: {', '.join(left)}: of the logger, of the force or of the moment, "
-            "or no running sensor has it, or held-out rows are further off with it"
+            f"not in sensor_amended.yaml: {', '.join(map(name_of, left))}: of the logger, of the force or of "
+            "the moment, or no running sensor has it, or held-out rows are further off with it"
         )
     return lines
 

@@ -238,7 +238,7 @@ def as_plain(found: Recording | PlainRecording) -> PlainRecording:
     if tdc is not None and found.unit("tdc") != "counts":  # of no temperature
         tdc = None
     missing, faults = check_clock(found, counts)
-    left = (note for note in found.notes if "left out" in note)
+    left = (note for note in found.notes if "left out" in note or "taken for dead" in note)
     said = (*remarks(found), *lacks, *(fault.message for fault in faults), *left)
     source = found.rate_source
     since = found.time - begin

@@ -68,8 +68,8 @@ def curves(panels: Sequence[Sequence[Panel]], simulated: str = "simulated") -> o
         ax.set_title(one.title, fontsize=8)
         ax.set_ylabel(one.unit, fontsize=8)
         ax.set_xlabel("time [s]" + ("; grey: held out" if one.aside else ""), fontsize=8)
-        ax.tick_params(labelsize=7)
         ax.label_outer()
+        ax.tick_params(labelsize=7, labelleft=True)  # every panel has a scale of its own
     axes[0, 0].legend(fontsize=7, ncols=3 if columns == 1 else 1)
     return figure
 
@@ -81,6 +81,8 @@ def channels(gaps: Sequence["Gap"]) -> object:
         x = np.arange(len(one.channels))
         ax.bar(x - 0.2, one.channels_before, 0.4, label="simulated", color=_UNAMENDED)
         ax.bar(x + 0.2, one.channels_after, 0.4, label="amended", color=_AMENDED)
+        for k in np.flatnonzero(np.isnan(one.channels_before)):
+            ax.text(k, 0, " no measurement", fontsize=7, rotation=90, ha="center", va="bottom")
         if np.isfinite(one.noise):
             ax.axhline(one.noise, color="k", lw=0.7, ls=":", label="noise and resolution")
         ax.set_xticks(x, one.channels, fontsize=7)

@@ -351,16 +351,14 @@ class Verdict:
         if not added:
             return f"{text}; {what} would explain what was fitted, and held-out data contradict it."
         own = [f.gap for f in self.effects if f.gap is not None and f.confirmed]
-        each = [one for one in self.gap.values() if one.gained] or own or [gap]
+        each = [one for one in self.gap.values() if one.before > _ABOVE * one.after] or own or [gap]
         other = max(each, key=lambda one: one.taken / max(one.before, 1e-12))
         if gap.gained:
             said = f"with {what} added it is {gap.after:.3g} {gap.unit}"
-        elif other.gained:
-            said = (
-                f"{what} takes {other.name} from {other.before:.3g} to {other.after:.3g} {other.unit} instead"
-            )
+        elif other.before > _ABOVE * other.after:
+            said = f"with {what} {other.before:.3g} {other.unit} in {other.name} become {other.after:.3g}"
         else:
-            said = f"{what} gains nothing there"
+            said = f"found beside it, with no share in it: {what}"
         return f"{text}; {said}{'; for the rest no cause is known' if self.unknown else ''}."
 
     def to_dict(self) -> dict:

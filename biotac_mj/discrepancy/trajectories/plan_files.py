@@ -69,7 +69,7 @@ def _ros(plan, path):
 def _picture(plan, path):
     from matplotlib.figure import Figure
 
-    lines = []
+    lines, labels = [], {}
     for k, one in enumerate(plan.contacts):
         said = f"{k + 1}. {one.contact.text} ({one.reason})"
         lines += textwrap.wrap(said, _WIDTH, subsequent_indent="    ")
@@ -83,7 +83,9 @@ def _picture(plan, path):
         x, z = 1e3 * t.pos[:, 0], 1e3 * t.pos[:, 2]
         place.plot(x, z, color=line.get_color())
         place.plot(x[0], z[0], "o", color=line.get_color())
-        place.annotate(str(k + 1), (x[0], z[0]), xytext=(4, 4), textcoords="offset points")
+        labels.setdefault((x[0], z[0]), []).append(str(k + 1))
+    for at, numbers in labels.items():
+        place.annotate(", ".join(numbers), at, xytext=(4, 4), textcoords="offset points")
     place.set(xlabel="x along the finger, tip at -x [mm]", ylabel="z across [mm]", title="where")
     time.set(xlabel="time of a contact [s]", ylabel="depth [mm]", title="how deep", xscale="symlog")
     words = figure.add_subplot(grid[1, :])
