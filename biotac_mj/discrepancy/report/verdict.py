@@ -237,8 +237,8 @@ class Verdict:
       effects: named and added, what closes most first. not_named: seen, and too weak or contradicted.
       gap: what is compared -> Gap, on held-out data. lead: which of them the headline is about; empty: the
         one that is most above noise. aside: what these data are, in words.
-      closed: share that all effects close of their own part of the gap, nan where there is none or the data
-        do not tell it within ten points; closed_within: least and most of it.
+      closed: share that all effects close of their own part of the gap, nan where there is none or
+        least and most of it are over 20 points apart; closed_within: these, less and plus a law's tenth.
       where: cells that disagree, dicts with "channel", the clearest first; where_note: what the cells are.
       remainder: what is left; unknown: whether something is left that has no name.
       tried: dicts with "name", one for each cause that was tried; tried_note: what their numbers are.
@@ -320,7 +320,7 @@ class Verdict:
 
     @property
     def share(self) -> str:
-        """What share is closed, in words; nothing where there is none."""
+        """What share is closed, in words; its interval alone where that is too wide, nothing without one."""
         low, high = self.closed_within
         if math.isnan(low):
             return ""
