@@ -205,7 +205,7 @@ def judge(case, recording, authors: Authors, protocol=None) -> dict:
         "named": [scored(*pair) for pair in zip([*d.findings, *d.late], verdict["effects"])],
         "weak": [
             scored(f, effect) | {"contradicted": f.confidence >= NAMED}
-            for f, effect in zip(d.rejected, verdict["not_named"])
+            for f, effect in zip(d.session.weak, verdict["not_named"])
         ],
         "outside": bool(set(case.truth) & authors.words.OUTSIDE),
         "unknown": d.rest.significant,

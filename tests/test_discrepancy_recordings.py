@@ -561,7 +561,7 @@ def test_what_the_part_kept_aside_contradicts_is_not_named():
     e[:, 4] += 100 * np.where(t < 0.6, np.sin(np.pi * t / 1.2) ** 2, 1 - 12 * (t - 0.6))
     d = diagnose_recording(PlainRecording(noisy(e, rng)))
     assert not any(f.verified is False for f in d.findings)
-    assert any(f.id == "drift" and f.channels == (4,) for f in d.rejected) or d.findings[0].verified, (
+    assert any(f.id == "drift" and f.channels == (4,) for f in d.session.weak) or d.findings[0].verified, (
         d.verdict
     )
 

@@ -91,9 +91,7 @@ def _theta(finding):
     kind = finding.kind
     if not kind.runs or kind.alike and not finding.of_all:
         return None
-    if any(finding.parameters[name][0] > most for name, most in kind.most.items()):
-        return None
-    effect = by_id(finding.id)
-    if not set(effect.params) <= set(finding.parameters):
+    beyond = any(finding.parameters[name][0] > most for name, most in kind.most.items())
+    if beyond or not set((effect := by_id(finding.id)).params) <= set(finding.parameters):
         return None
     return {n: float(np.clip(finding.parameters[n][0], p.low, p.high)) for n, p in effect.params.items()}

@@ -21,6 +21,7 @@ from .session import Session
 
 _PANELS = 4  # channels, of the report's first figure
 _CHECKUP = "three minutes of touches that isolate one effect each tell what a plain log mixes"
+_ORDER = "rest levels unlike those of published sensors: an order of channels that is wrong all the time"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,11 +49,6 @@ class RecordingDiagnosis(Verdict):
     def findings(self) -> list[Candidate]:
         """Named, the largest gap closed first."""
         return self.session.ordered
-
-    @property
-    def rejected(self) -> list[Candidate]:
-        """Findings that held-out rows contradict or that are too weak to be named."""
-        return self.session.weak
 
     def panels(self) -> list[list[Panel]]:
         """Electrodes that never measure and those that the effects change most, or those with the largest
@@ -107,7 +103,7 @@ def concluded(
         unknown=left.significant,
         tried=_tried(session, found),
         tried_note="confidence of each cause that these data can show; none where nothing looks like it",
-        notes=not_identifiable(session) + _order(r),
+        notes=not_identifiable(session) + [_ORDER] * (r.absolute and not r.rest_correlation >= REST_LIKE),
         next_experiment="; ".join(further + ([] if protocol else [_CHECKUP])),
         next_command="" if protocol else "biotac checkup --out protocol.yaml",
         amended=_amended(session),
@@ -169,10 +165,3 @@ def _amended(session):
             "the moment, or no running sensor has it, or held-out rows are further off with it"
         )
     return lines
-
-
-def _order(recording):
-    """Line on an order of channels that is wrong all the time."""
-    if not recording.absolute or recording.rest_correlation >= REST_LIKE:
-        return []
-    return ["rest levels unlike those of published sensors: an order of channels that is wrong all the time"]
