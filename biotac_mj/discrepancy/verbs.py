@@ -123,7 +123,6 @@ def diagnose_with_states(
     from ..recordings.recording import designed
     from .plates import tables
     from .plates.diagnosis import diagnose_presses
-    from .recordings.search import diagnose_recording
 
     effects = PLATE if effects is None else effects
     for k, one in enumerate(recordings):
@@ -137,9 +136,8 @@ def diagnose_with_states(
     geometry = load_skin(shipped_skin(design, "coarse"))  # states of the default's take ten times as long
     base, states = tables.base_response(geometry, quiet)
     response = tables.with_effects(base, states, geometry, effects, quiet)
-    found = diagnose_presses(recordings, response, effects, quiet)
-    first = diagnose_recording(recordings[0], progress=not quiet) if first is None else first
-    _reported(found.joined(first), folder)
+    found = diagnose_presses(recordings, response, effects, quiet, first)
+    _reported(found, folder)
     return found
 
 

@@ -18,13 +18,19 @@ from ...skin.settings import plain
 from ..evidence import RATE, asked, by_chance, max_t, not_distinguished
 from ..recordings.diagnosis import RecordingDiagnosis
 from ..recordings.recording import PlainRecording
-from ..report.plots import Panel, Table
-from ..report.verdict import Estimate, Finding, Gap, Verdict, electrode_names
+from ..recordings.search import diagnose_recording
+from ..report.plots import Table
+from ..report.verdict import Estimate, Finding, Gap, electrode_names
 from .models import Fit, fitted, press_rows
 
 _LEAST = 5e-3  # [N] noise of a force
 _LEADS = 1.3  # times the median electrode's RMS: such electrodes lead
 _BLOCKS = 16  # units of time: rows of one press are one piece of evidence
+_OFF = "electrodes of simulated presses that are off; RMS [counts], and expected"
+_TRIED = (
+    "evidence of each over the base model, all states marginalised; RMS [counts] without -> with it on rows "
+    "that took no part in any fit; its value, 95 %"
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -124,50 +130,17 @@ class Tried:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PlateDiagnosis(Verdict):
-    """A verdict on flat presses.
+class PlateDiagnosis(RecordingDiagnosis):
+    """A verdict on the first recording of flat presses, and what simulated states show of all.
 
     Attributes:
       sensors; models: those with most evidence first; named: those that the evidence names, all of them tied
-        where it cannot part them; first: what was found in the first recording alone, see `joined`.
+        where it cannot part them.
     """
 
     sensors: list[Sensor]
     models: list[Tried]
     named: list[Tried]
-    first: RecordingDiagnosis | None = None
-
-    @property
-    def acting(self) -> Tried | None:
-        """The named effect with most evidence that can act in a model, tied or not, and is no further off
-        with what was held out."""
-        some = (f for f in self.named if f.attached and not f.further_off)
-        return max(some, key=lambda f: f.evidence, default=None)
-
-    def joined(self, first: RecordingDiagnosis) -> "PlateDiagnosis":
-        """This one with what was found in its first recording alone."""
-        lists = {
-            name: [*getattr(first, name), *getattr(self, name)]
-            for name in ("warnings", "effects", "not_named", "where", "notes", "amended")
-        }
-        return dataclasses.replace(
-            self,
-            **{name: getattr(first, name) for name in ("kind", "name", "data", "aside")},
-            significant=first.significant or self.significant,
-            gap=first.gap | self.gap,
-            lead=max(self.gap, key=lambda name: self.gap[name].loudness) if self.significant else "",
-            where_note="; ".join(one.where_note for one in (first, self) if one.where),
-            remainder="; ".join(filter(None, (first.remainder, self.remainder))),
-            unknown=first.unknown or self.unknown,
-            next_experiment=first.next_experiment,
-            next_command=first.next_command,
-            details=first.details,
-            first=first,
-            **lists,
-        )
-
-    def panels(self) -> list[list[Panel]]:
-        return self.first.panels() if self.first else []
 
     def table(self) -> Table:
         """What each model takes away of the squared error of the worst electrodes, with dots for those that
@@ -178,12 +151,10 @@ class PlateDiagnosis(Verdict):
             closed, [f.effect.name for f in self.models], [s.name for s in self.sensors], dots, "gained [%]"
         )
 
-    def sensor(self) -> SensorFile | None:
+    def sensor(self) -> SensorFile:
         """The first recording's sensor (rest, noise, effects), with the rubber that its poses were fitted
         with and the skin's settings that its named effect asks for, if any."""
-        if self.first is None:
-            return None
-        file, acting = self.first.sensor(), self.acting
+        file, acting = super().sensor(), _acting(self.named)
         if acting is None:
             return file
         given, tested = acting.attached[0], acting.tested[0]
@@ -195,16 +166,25 @@ class PlateDiagnosis(Verdict):
         return SensorFile(base, file.effects, file.intervals)
 
 
+def _acting(named):
+    """The named effect with most evidence that can act in a model, tied or not, and is no further off with
+    what was held out, or None."""
+    some = (f for f in named if f.attached and not f.further_off)
+    return max(some, key=lambda f: f.evidence, default=None)
+
+
 def diagnose_presses(
     recordings: list[PlainRecording],
     response: Response,
     effects: tuple[PlateEffect, ...] = PLATE,
     quiet: bool = False,
+    first: RecordingDiagnosis | None = None,
 ) -> PlateDiagnosis:
     """Diagnoses recordings of flat presses of one or more sensors.
 
     Args:
       response: the base model's, with a change for each of `effects`, in their order.
+      first: what was found in the first recording alone; None: it is diagnosed.
 
     Raises:
       ValueError: a recording without force, or with too few loaded rows.
@@ -221,7 +201,8 @@ def diagnose_presses(
                 parts.append(fitted(response.only(k), recording, one.rows, one.noise, one.fit))
                 bar.update()
     tried = _tried(effects, tested, sensors)
-    return _concluded(sensors, tried, _named(tried))
+    first = diagnose_recording(recordings[0], progress=not quiet) if first is None else first
+    return _concluded(first, sensors, tried, _named(tried))
 
 
 def _tried(effects, tested, sensors):
@@ -254,45 +235,35 @@ def _named(tried):
     return [f for f in good if f is good[0] or tied(f)]
 
 
-def _concluded(sensors, tried, named):
-    off = [one for s in sensors for one in s.off]
-    out = PlateDiagnosis(
-        kind="flat presses, simulated",
-        name=", ".join(s.name for s in sensors),
-        data=f"{', '.join(str(len(s.rows[0])) for s in sensors)} loaded rows, each with a fitted pose",
-        significant=bool(off),
-        effects=[_finding(f, named, tried, sensors) for f in named],
-        gap={
-            f"worst electrodes of {s.name} in simulated presses": s.gap(
-                named[0].tested[k] if named else s.fit
-            )
-            for k, s in enumerate(sensors)
-        },
-        aside="rows that took no part in any fit",
-        where=off,
-        where_note="electrodes of simulated presses that are off; RMS [counts], and expected",
-        remainder="" if named or not off else "no effect that was tried takes the gap away",
-        unknown=bool(off) and not named,
-        tried=[_row(f, s, t) for f in tried for s, t in zip(sensors, f.tested)],
-        tried_note=(
-            "evidence of each over the base model, all states marginalised; RMS [counts] without -> with it "
-            "on rows that took no part in any fit; its value, 95 %"
-        ),
-        sensors=sensors,
-        models=tried,
-        named=named,
-    )
-    lines = (
-        [f"sensor_amended.yaml has, as {sensors[0].name} has it: {out.acting.effect.name}"]
-        if out.acting
-        else []
-    )
+def _concluded(first, sensors, tried, named):
+    """What was found in the first recording alone, and what states show of all sensors."""
+    off, acting = [one for s in sensors for one in s.off], _acting(named)
+    gap = {
+        f"worst electrodes of {s.name} in simulated presses": s.gap(named[0].tested[k] if named else s.fit)
+        for k, s in enumerate(sensors)
+    }
+    lines = [f"sensor_amended.yaml has, as {sensors[0].name} has it: {acting.effect.name}"] if acting else []
     lines += [
         f"{f.effect.name} as {s.name} has it: attach(spec, **{given})"
         for f in named
         for s, given in zip(sensors, f.attached or ())
     ]
-    return dataclasses.replace(out, amended=lines)
+    notes = first.where_note if first.where else "", _OFF if off else ""
+    left = "no effect that was tried takes the gap away" if off and not named else ""
+    told = {
+        "effects": [*first.effects, *(_finding(f, named, tried, sensors) for f in named)],
+        "where": [*first.where, *off],
+        "amended": [*first.amended, *lines],
+        "significant": first.significant or bool(off),
+        "gap": first.gap | gap,
+        "lead": max(gap, key=lambda name: gap[name].loudness) if off else "",
+        "where_note": "; ".join(filter(None, notes)),
+        "remainder": "; ".join(filter(None, (first.remainder, left))),
+        "unknown": first.unknown or bool(left),
+        "tried": [_row(f, s, t) for f in tried for s, t in zip(sensors, f.tested)],
+        "tried_note": _TRIED,
+    }
+    return PlateDiagnosis(**vars(first) | told, sensors=sensors, models=tried, named=named)
 
 
 def _finding(f, named, tried, sensors):
