@@ -4,9 +4,10 @@
     python benchmarks/discrepancy_confidence.py out/first.json out/second.json --left-out
     python benchmarks/discrepancy_confidence.py out/checkup.json --checkup
 
-JSON are files of `discrepancy_recordings.py`. The weights go into
-`biotac_mj/discrepancy/recordings/confidence.json`; those of faults of the log stay in `quality.confidence`.
---checkup prints what stands there of what a checkup alone finds, by files of `checkup_labs.py`.
+JSON are files of `discrepancy_recordings.py`. The weights go into `biotac_mj/quality/confidence.json`, in
+which those of faults of the log stay, and what is usual of what is left into
+`biotac_mj/discrepancy/recordings/usual.json`. --checkup prints what stands in the first of what a checkup
+alone finds, by files of `checkup_labs.py`.
 --parts: only these of them, detectors or kinds of recordings.
 --left-out writes nothing: the table of each author's pieces, named by weights that are fitted to the other
 authors' alone.
@@ -20,12 +21,16 @@ import numpy as np
 from discrepancy_recordings import table
 from records import read_json, write_json
 
-from biotac_mj.discrepancy.recordings.confidence import NAMED, farthest
-from biotac_mj.quality.confidence import NEW, PER_CANDIDATE, WEIGHTS, decades, probability
+from biotac_mj.discrepancy.recordings.rest import farthest
+from biotac_mj.quality.confidence import NAMED, NEW, PER_CANDIDATE, decades, probability
 
 __all__ = ["authors_left_out", "fit"]
 
-_FITTED = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy/recordings/confidence.json"
+_PACKAGE = pathlib.Path(__file__).parents[1] / "biotac_mj"
+_FITTED = {
+    "weights": _PACKAGE / "quality/confidence.json",
+    "usual": _PACKAGE / "discrepancy/recordings/usual.json",
+}
 
 # features that a detector's confidence is made of, and their signs: more evidence never speaks against a name
 FEATURES = {
@@ -88,13 +93,13 @@ def of_checkups(rows: list) -> dict:
 
 def _candidates(rows):
     """What neither sign flips nor the held-out part contradict, each with the number of others of its
-    detector in the piece, but for faults of the log, whose weights are in `quality.confidence`."""
+    detector in the piece, but for faults of the log."""
     out = []
     for i, row in enumerate(rows):
         every = [n["detector"] for n in (*row["named"], *row["weak"])]
         mine = [*row["named"], *(n for n in row["weak"] if not n["contradicted"] and n["p"] < FLIPS)]
         out += [n | {"row": i, "beside": max(every.count(n["detector"]) - 1 - n["pair"], 0)} for n in mine]
-    return [n for n in out if n["detector"] not in WEIGHTS]
+    return [n for n in out if n["detector"] in FEATURES]
 
 
 def _logistic(cases, signs):
@@ -160,15 +165,14 @@ def authors_left_out(rows: list) -> list:
     out = []
     for author in dict.fromkeys(r["half"] for r in rows):
         fitted = fit([r for r in rows if r["half"] != author])
-        weights = {name: (w["intercept"], w["features"]) for name, w in fitted["weights"].items()}
         mine = [r for r in rows if r["half"] == author]
         lacking = sorted({r["left"] for r in mine} - fitted["usual"].keys())
         if lacking:
             kinds = " and ".join(lacking)
             raise SystemExit(f"without {author}'s no {kinds} recording has no effect: give more pieces")
-        said = [[n for n in r["named"] if n["detector"] in WEIGHTS] for r in mine]
+        said = [[n for n in r["named"] if n["detector"] not in FEATURES] for r in mine]
         for n in _candidates(mine):
-            p = probability(n["detector"], n["features"], n["beside"], weights)
+            p = probability(n["detector"], n["features"], n["beside"], fitted["weights"])
             if p >= NAMED:
                 said[n["row"]].append(n | {"confidence": p})
         for r, names in zip(mine, said):
@@ -199,10 +203,9 @@ def main(argv=None):
             print(author, table([r for r in rows if r["half"] == author]), sep="\n", end="\n\n")
         print("all", table(rows), sep="\n")
         return
-    fitted, shipped = fit(rows), read_json(_FITTED, {})
-    for part, values in fitted.items():
-        shipped[part] |= {name: v for name, v in values.items() if name in (options.parts or values)}
-    write_json(_FITTED, shipped)
+    for part, values in fit(rows).items():
+        some = {name: v for name, v in values.items() if name in (options.parts or values)}
+        write_json(_FITTED[part], read_json(_FITTED[part], {}) | some)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,7 @@ from scipy.ndimage import gaussian_filter1d
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings import search
 from biotac_mj.discrepancy.recordings.candidates import Candidate
-from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence
-from biotac_mj.quality.confidence import probability
+from biotac_mj.quality.confidence import NAMED, confidence, probability
 
 
 def sure(detector, features, beside):
@@ -36,7 +35,7 @@ def test_the_other_of_a_pair_is_no_argument_against_an_electrode():
 def test_confidence_is_that_of_authors_who_were_blind(stated, right):
     """What the weights say of forms that they were fitted to, and how many names of two authors whose forms
     they had not seen were right there; both errors and a bin's spread together are some 0.06."""
-    weights = {"any": (np.log(stated / (1 - stated)), {})}
+    weights = {"any": {"intercept": np.log(stated / (1 - stated)), "features": {}}}
     assert abs(probability("any", {}, 0, weights) - right) < 0.07
 
 

@@ -182,8 +182,7 @@ class Entry:
       requires: data that a recording needs to show it without poses: "force"; "tdc"; "rest" and "sign" of
         the counts; "time" to separate touches from drift; "load"; "change", that it begins or ends in the
         recording; "protocol" of a checkup; "poses", where nothing else suffices.
-      detector: class of evidence in logs, which sets a name's confidence
-        (`discrepancy.recordings.confidence`).
+      detector: class of evidence in logs, which sets a name's confidence (`quality.confidence`).
     """
 
     id = name = stage = physics = ""

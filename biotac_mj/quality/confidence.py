@@ -1,4 +1,8 @@
-"""Probability that a fault of a log is correctly named: logistic regression on its features."""
+"""Probability that a fault of a log, or what a diagnosis finds in it, is correctly named: logistic regression
+on its features."""
+
+import json
+import pathlib
 
 import numpy as np
 
@@ -17,28 +21,10 @@ _MOST = 0.99  # fraction of the most confident names that were right
 PER_CANDIDATE = -1.2445
 # a faulty connector or cable affects two channels, so one further candidate is no counter-evidence
 PAIRS = {"still", "one"}
-# intercept and, per feature, weight, lower and upper bound of the training data. Fitted to hidden effects of
-# eleven authors in recordings of real sensors; "gone" (one of one was right), "loud" and "memory" to 98
-# checkups by two authors (`benchmarks/discrepancy_confidence.py --checkup`)
-WEIGHTS = {
-    "clock": (2.546, {}),
-    "cut": (1.293, {}),
-    "dead": (10.0, {}),
-    "gone": (0.95, {}),
-    "limit": (
-        -6.788,
-        {"nats": (1.052, 0.0, 15.77), "blocks": (2.254, 0.0, 1.0), "runs": (0.09967, 0.0, 5.952)},
-    ),
-    "line": (-8.844, {"score": (3.378, 0.0, 8.041)}),
-    "loud": (-3.801, {"decades": (1.973, -1.6, 6.5)}),
-    "lost": (-11.168, {"times": (0.3801, 0.0, 26.25), "score": (1.0711, 0.0, 4.795)}),
-    "memory": (-6.011, {"decades": (0.807, -7.8, 24.8)}),
-    "rail": (1.334, {}),
-    "rows": (-3.873, {"nats": (1.1196, -1.4, 8.438)}),
-    "samples": (-4.659, {"nats": (1.0247, 0.0, 17.32)}),
-    "single": (-2.857, {"isolation": (1.8026, -4.728, 5.931)}),
-    "still": (2.257, {"nats": (0.1192, 4.586, 12.47), "runs": (-0.8219, 0.0, 6.033)}),
-}
+# detector -> intercept and, per feature, weight, lower and upper bound of the training data. Fitted to hidden
+# effects of eleven authors in recordings of real sensors; "gone" (one of one was right), "loud" and "memory"
+# to 98 checkups by two authors (`benchmarks/discrepancy_confidence.py`)
+WEIGHTS: dict = json.loads(pathlib.Path(__file__).with_name("confidence.json").read_text())
 
 
 def probability(detector: str, features: dict, others: int = 0, weights: dict = WEIGHTS) -> float:
@@ -49,9 +35,9 @@ def probability(detector: str, features: dict, others: int = 0, weights: dict = 
     """
     if detector not in weights:
         return 0.0
-    intercept, own = weights[detector]
-    logit = intercept + PER_CANDIDATE * np.log1p(max(others - (detector in PAIRS), 0))
-    for name, (weight, low, high) in own.items():
+    own = weights[detector]
+    logit = own["intercept"] + PER_CANDIDATE * np.log1p(max(others - (detector in PAIRS), 0))
+    for name, (weight, low, high) in own["features"].items():
         logit += weight * np.clip(features.get(name, 0.0), low, high)
     return min(1 / (1 + float(np.exp(-NEW * logit))), _MOST)
 
@@ -61,11 +47,10 @@ def decades(p: float) -> float:
     return -float(np.log10(max(p, 1e-12)))
 
 
-def confidence(fault: Fault, others: int = 0, weights: dict = WEIGHTS) -> float:
-    """Probability that the fault is correctly named. others, weights: see `probability`. 1 without a
-    detector."""
+def confidence(fault: Fault, others: int = 0) -> float:
+    """Probability that the fault is correctly named. others: see `probability`."""
     features = fault.features | {"decades": decades(fault.p)}
-    return probability(fault.detector, features, others, weights) if fault.detector else _MOST
+    return probability(fault.detector, features, others) if fault.detector else _MOST
 
 
 def clear(fault: Fault) -> bool:

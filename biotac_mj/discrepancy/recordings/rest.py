@@ -2,6 +2,8 @@
 others and from its own earlier blocks."""
 
 import dataclasses
+import json
+import pathlib
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -9,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from ...quality.adjacent import sharp
 from ...quality.clock import CLOCK_FAULT
+from ...quality.confidence import NAMED
 from ...quality.noise import noise_level, running_median
 from .candidates import as_log
-from .confidence import NAMED, USUAL, farthest
 from .segments import sharply_touched
 from .session import Session
 
@@ -25,11 +27,15 @@ _BY_HAND = 10.0  # [Hz] below which a load moves
 _RESOLVED = 1.0  # [counts] by which an electrode departs at least, or a rhythm moves it
 _OWN = 4  # electrodes of 19 that change from one row to the next by themselves: a touch moves more
 _FEW = 3  # samples that are sharp in a recording of any length
+# kind of recordings -> what is usual of those without an effect (`farthest`), and the limit that one in ten
+# of them exceeds (`benchmarks/discrepancy_confidence.py`)
+USUAL: dict = json.loads(pathlib.Path(__file__).with_name("usual.json").read_text())
+_FAR = 6.0  # spreads: what lies beyond is unusual, whatever it is
 
 
 @dataclasses.dataclass
 class Rest:
-    """significant; text; kind of recordings that it is compared with (`confidence.USUAL`); cells: dicts
+    """significant; text; kind of recordings that it is compared with (`USUAL`); cells: dicts
     (channel, from, to, counts) of what departs, the largest first; features: numbers that the decision is
     made of."""
 
@@ -75,6 +81,25 @@ def rest(session: Session) -> Rest:
     if not (faults or compared):
         text = f"what fewer than {_COMPARED} new rows leave is not compared with that of other recordings"
     return Rest(bool(faults), text, kind, listed, features)
+
+
+def farthest(features: dict, usual: dict) -> tuple[float, str]:
+    """Largest deviation of a recording's features above their usual values, in spreads, and the feature's
+    name.
+
+    Args:
+      features: with the logarithm of the recording's seconds. usual: name -> (median, its change with the
+        logarithm of the seconds, spread).
+    """
+    seconds = features["seconds"]
+    return max(
+        (
+            (min(max((features[name] - middle - slope * seconds) / spread, 0.0), _FAR), name)
+            for name, (middle, slope, spread) in usual.items()
+            if name in features
+        ),
+        default=(0.0, ""),
+    )
 
 
 def _kind(session, low):

@@ -7,13 +7,12 @@ import numpy as np
 import tqdm
 
 from ...quality.check import less, lost_rows, sample_faults
-from ...quality.confidence import clear
+from ...quality.confidence import NAMED, clear, confidence
 from ...quality.still import at_rest, between_rests
 from ...recordings import Recording
 from ...recordings.protocol import Protocol
 from ..evidence import discoveries
 from .candidates import as_candidates, as_log
-from .confidence import NAMED, confidence
 from .detectors.jumps import jumped
 from .detectors.lagging import lagging
 from .detectors.latency import delayed
