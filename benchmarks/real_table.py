@@ -180,7 +180,7 @@ def _shared(files):
     return dict(zip(("coherence", "mean_square"), np.mean(rows, 0).tolist(), strict=True))
 
 
-def let_go(path: pathlib.Path, skin: str) -> dict | None:
+def release(path: pathlib.Path, skin: str) -> dict | None:
     """{row: (real, simulated)} of what a native log has after a press is let go, which is where PDC falls
     most, and the simulated sensor after a plate has pressed it; None of a log without."""
     rows = read_rows(path)
@@ -357,7 +357,7 @@ def build(data: pathlib.Path, skin: str, every: int, calibrated: bool) -> tuple[
         real, mine = resting(path)
         for name, one in (("std [counts]", np.std), ("lag-1 correlation", _lag)):
             add(f"PAC at rest, {name}", path.name, float(one(real)), float(one(mine)))
-        for name, pair in {**(let_go(path, skin) or {}), **(tap(path, skin) or {})}.items():
+        for name, pair in {**(release(path, skin) or {}), **(tap(path, skin) or {})}.items():
             add(name, path.name, *pair)
     with tempfile.TemporaryDirectory() as folder:
         pressed, free = presses(data, folder)

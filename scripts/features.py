@@ -397,8 +397,7 @@ of a trajectory (diagnose), shared among the steps between two rows. `skin.step`
 each world. The interval before the first row is as long as the one after it.
 
 `batch.attach(worlds={...})` and `skin.per_world.make_worlds` take (nworld,) numbers by name; `biotac data
-generate
---vary` draws them, and numbers of the material, anew for each interaction and keeps what was drawn in its
+generate --vary` draws these numbers, and the material's, anew for each interaction and stores them in its
 parameters."""
 
 

@@ -906,7 +906,7 @@ def numbers():
     yield Row("play roll_rod --render out.png", "out.png does not end in .gif")
     yield Row("diagnose", "nothing to diagnose")
     for data in ("set", "shard.h5"):
-        yield Row(f"diagnose {data} --object abc", f"{data} says itself what touched: leave --object out")
+        yield Row(f"diagnose {data} --object abc", f"{data} records what touched: leave --object out")
     also = "diagnose --quiet --electrodes electrodes.txt --force force.txt --simulate --also"
     yield Row(f"{also} nowhere force.txt", "nowhere: no such file: check its name")
     yield Row(f"{also} electrodes.txt mesh", "mesh: no such file: it is a folder")

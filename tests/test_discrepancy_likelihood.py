@@ -90,7 +90,7 @@ def test_trajectories_apart_share_laws_and_no_discrepancy(plain):
     assert np.abs(covariance[:first, first:]).max() < 1e-9 < np.abs(joint[:first, first:]).max()
     for part in (slice(first), slice(first, None)):
         np.testing.assert_allclose(covariance[part, part], joint[part, part], atol=1e-9)
-    np.testing.assert_array_equal(own.courses, whole.courses)
+    np.testing.assert_array_equal(own.error_modes, whole.error_modes)
 
 
 def test_the_kernel_is_a_covariance():

@@ -89,24 +89,24 @@ def test_weights_follow_the_evidence_and_the_number_of_effects():
     assert np.log(ten[0] / ten[1]) == pytest.approx(2 * np.log(twenty[0] / twenty[1]))
 
 
-def explained(*names, told=0.0, off=0.0):
+def explained(*names, own=0.0, off=0.0):
     """A Fit of 12 contacts with these effects, whose poses are off by the same [m]."""
     effects, offsets = [(by_id(name), by_id(name).default()) for name in names], np.full((12, 3), off)
-    return Fit(effects, Nuisance(), [], np.zeros((0, 0)), told, offsets=offsets, told=told)
+    return Fit(effects, Nuisance(), [], np.zeros((0, 0)), own, offsets=offsets, own_evidence=own)
 
 
 def test_errors_of_poses_are_evidence_of_every_contact():
     """They are another in each, whatever the likelihood leaves out of all; not where a likelier explanation
     without an offset of all poses leaves them as small."""
     comparison = types.SimpleNamespace(repeatability=5e-5)
-    null, found = explained(off=6e-5), explained("depth0", told=22.0)
+    null, found = explained(off=6e-5), explained("depth0", own=22.0)
     scatter = 18 * (6 / 5) ** 2
     assert _posed(comparison, found, [null, found]) == pytest.approx(min(scatter, 22.0))
-    for other, known in ((explained("stiffen", told=50.0), 0.0), (explained("stiffen", told=9.0), 22.0)):
+    for other, known in ((explained("stiffen", own=50.0), 0.0), (explained("stiffen", own=9.0), 22.0)):
         fits = [null, other, found]
         assert _posed(comparison, found, fits) == pytest.approx(known)
         assert _posed(comparison, other, fits) == 0.0
-    both, alone = explained("stiffen", "depth0", told=60.0), explained("stiffen", told=9.0, off=1e-5)
+    both, alone = explained("stiffen", "depth0", own=60.0), explained("stiffen", own=9.0, off=1e-5)
     assert _posed(comparison, both, [null, alone, both]) == pytest.approx(18 * (1 / 5) ** 2)
 
 

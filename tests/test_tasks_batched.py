@@ -233,7 +233,7 @@ def test_a_lesson_has_another_goal_and_what_is_done_for_it():
     env = make("roll_rod", 2, hand=HAND, device="cpu", settings=settings, history=3)
     env.step(torch.ones(2, 6))
     first, before = env.script(), env._place_before.clone()
-    sensed, wish = env.aim_anew(env.sensed(), first)
+    sensed, wish = env.change_goal(env.sensed(), first)
     env._target = 1e-3 * sensed["body"][:, 0, -2]
     assert (env.target - env.cfg.target[0] >= 0).all() and (env.target <= env.cfg.target[1]).all()
     env._place_before[:] = torch.nan

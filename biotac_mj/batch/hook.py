@@ -198,7 +198,7 @@ class Hook:
         self._find_compliance(m, d, moving)
         self._solve(moving, lambda batch: batch.solve_first(m, d))
         self._choose(moving, lambda batch, found: batch.compare(found))
-        self._go_on(m, d, moving)
+        self._run_rounds(m, d, moving)
         self._choose(moving, lambda batch, found: batch.find_energy(taking_part, found))
         wp.capture_if(going.any, lambda: self._damp(m, d, moving))
         self._choose(moving, lambda batch, found: batch.restrain(d, taking_part, found))
@@ -218,19 +218,19 @@ class Hook:
         self._fork.run(*(functools.partial(choose, batch, self._next) for batch in moving))
         self._going.copy(self._next)
 
-    def _go_on(self, m, d, moving):
+    def _run_rounds(self, m, d, moving):
         """Rounds of the worlds that are going, until all are settled or cannot be."""
 
         def solve():
             self._find_compliance(m, d, moving)
             self._solve(moving, lambda batch: batch.solve_again(m, d))
 
-        def go_on():
+        def one_round():
             self._accelerate(m, d, moving)
             self._choose(moving, lambda batch, found: batch.judge(self._going, found))
             wp.capture_if(self._going.any, solve)
 
-        wp.capture_while(self._going.any, go_on)
+        wp.capture_while(self._going.any, one_round)
 
     def _damp(self, m, d, moving):
         """Backward Euler's step in the worlds that are going."""
@@ -238,7 +238,7 @@ class Hook:
             batch.use_euler(m, d)
         self._accelerate(m, d, moving)
         self._find_compliance(m, d, moving)
-        self._go_on(m, d, moving)
+        self._run_rounds(m, d, moving)
         for batch in moving:
             batch.find_energy(self._taking_part, self._next)
 
@@ -293,14 +293,14 @@ class Hook:
                 worlds, threads = [d.nworld], integrator.BLOCK
                 Launcher(device).launch_blocks(integrator.find_amiss, worlds, known, again, threads)
 
-            def go_on():
+            def one_round():
                 self._slope.find(m, d, self._integrator, correction)
                 self._find_accelerations(m, d, moving, correction.going)
                 compare()
 
             wp.launch(integrator.begin_correction, d.nworld, [going, correction], device=device)
             compare()
-            wp.capture_while(self._amiss, go_on)
+            wp.capture_while(self._amiss, one_round)
         self._fork.run(*(functools.partial(batch.evaluate, m, d, self._integrator.qacc) for batch in moving))
 
     def _find_accelerations(self, m, d, moving, going, first=False):

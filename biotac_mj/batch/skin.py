@@ -254,12 +254,12 @@ def solve_group(skins: Sequence[BatchSkin], fork: Fork) -> None:
         return
     going = condensed[0]._going
 
-    def go_on():
+    def continue_all():
         going.zero_()
         fork.run(*(functools.partial(skin._condensed.continue_solve, going) for skin in condensed))
 
     going.fill_(1)
-    wp.capture_while(going, go_on)
+    wp.capture_while(going, continue_all)
 
 
 def _refuse_differences(data, materials, worlds):

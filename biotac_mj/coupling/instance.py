@@ -133,7 +133,7 @@ class Instance:
 
     @property
     def by_stages(self) -> bool:
-        """Whether a step is Runge-Kutta's, of four stages."""
+        """Whether the integrator is RK4, whose four stages all call the skin."""
         return self.model.opt.integrator == _RK4
 
     def refuse_foreign_state(self, cause: Exception | None = None) -> None:

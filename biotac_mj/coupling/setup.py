@@ -54,7 +54,7 @@ class _Skin:
 
 
 def skin_thickness(geometry: SkinGeometry) -> float:
-    """From the skin's outside to the core at most [m]."""
+    """Largest distance of a free outer node from the core's nearest vertex [m]."""
     free = np.setdiff1d(geometry.outer_face, geometry.fixed)
     return float(KDTree(geometry.core_vert).query(geometry.vert[free])[0].max(initial=0.0))
 

@@ -322,7 +322,7 @@ class DataView(_View):
         """Makes the poses of bodies, geoms and sites those of the positions of now."""
         LIBRARY.mj_kinematics(self.model.address, self.address)
 
-    def go_on(self, seconds: float) -> None:
+    def integrate_positions(self, seconds: float) -> None:
         """Moves the positions on at the present velocity, for `seconds`."""
         where = self.qpos.ctypes.data, self.qvel.ctypes.data
         if seconds:
@@ -335,7 +335,7 @@ class DataView(_View):
             yield
             return
         before = self.qpos.copy()
-        self.go_on(seconds)
+        self.integrate_positions(seconds)
         self._find_motion()
         try:
             yield

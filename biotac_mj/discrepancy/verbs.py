@@ -42,7 +42,7 @@ def diagnose_verb(args: argparse.Namespace) -> None:
     elif args.which and not args.electrodes:
         raise ValueError(f"--recording is of a log, and {args.data[:80]} holds trajectories: leave it out")
     if args.data and args.object and not recordings:
-        raise ValueError(f"{args.data[:80]} says itself what touched: leave --object out")
+        raise ValueError(f"{args.data[:80]} records what touched: leave --object out")
     if args.also and not args.simulate or args.simulate and not (args.electrodes and args.force):
         raise ValueError(
             "--simulate needs a flat press with its force, and --also needs --simulate: give "

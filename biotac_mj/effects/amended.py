@@ -33,8 +33,8 @@ _ORDER = {effect.id: i for i, effect in enumerate(CATALOGUE)}
 
 @dataclasses.dataclass
 class Model:
-    """Settings of a sensor, as for `attach`: all but `friction` may be None.
-    `friction` is the caller's."""
+    """Settings of a sensor, as for `attach`; None stands for a default. Only `friction`, which the caller
+    gives, is never None."""
 
     skin: str | pathlib.Path | SkinGeometry | None
     material: object

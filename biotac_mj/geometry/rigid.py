@@ -112,8 +112,8 @@ def displace(
 
 
 def rigid_motions(x: np.ndarray, size: int) -> np.ndarray:
-    """Motion (size, 6) of the coordinates of points x (n, 3) on a rigid body, by its translation and rotation
-    vector; zero after the first 3 n rows."""
+    """Derivative (size, 6) of the coordinates of points x (n, 3) of a rigid body with respect to its
+    translation and rotation vector; zero after the first 3 n rows."""
     out = np.zeros((size, 6))
     motion = out[: 3 * len(x)].reshape(-1, 3, 6)
     motion[:, :, :3] = np.eye(3)

@@ -173,8 +173,8 @@ def check_closed(face: np.ndarray, name: str = "surface") -> None:
 
 
 def check_volumes(vert: np.ndarray, elem: np.ndarray, of: str = "") -> None:
-    """Raises ValueError if tetrahedra (nelem, 4 or more) are inverted or degenerate; of: their skin, in the
-    text."""
+    """Raises ValueError if tetrahedra (nelem, 4 or more) are inverted or degenerate; of: names their skin in
+    the message."""
     edges = np.moveaxis(vert[elem[:, 1:4]] - vert[elem[:, :1]], 1, 2)
     volume = np.linalg.det(edges) / 6
     bad = np.flatnonzero(~(volume > 1e-9 * np.abs(edges).max(axis=(1, 2)) ** 3))

@@ -43,10 +43,10 @@ def between_rests(log: Log, rests: Sequence[slice], faults: Sequence[Fault] = ()
     """What the noise says of several rests, in which nothing touches the sensor, together: noise of channels
     is independent, and as much in the last rest as in the first."""
     sound = np.ones(log.channels, bool)
-    told = (
+    faulty = (
         f for f in faults if len(f.channels) <= log.some(_OWN) or f.step or f.correct or f.mask is not None
     )
-    sound[[k for f in told for k in f.channels]] = False
+    sound[[k for f in faulty for k in f.channels]] = False
     fresh = ~log.repeated & ~log.masked[:, sound].any(1)
     off = []
     for rows in rests:

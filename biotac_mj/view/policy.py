@@ -58,10 +58,10 @@ def play_task(
     """
     if hand and "hand" not in inspect.signature(TASKS[task]).parameters:
         raise ValueError(f"hand is not of {task}: leave it out")
-    ways = dict(episodes=episodes, render=render, window=window, port=port)
-    given = [name for name, value in ways.items() if value]
+    displays = dict(episodes=episodes, render=render, window=window, port=port)
+    given = [name for name, value in displays.items() if value]
     if len(given) > 1:
-        raise ValueError(f"{' and '.join(given)} are given: a task is played in one of these ways")
+        raise ValueError(f"{' and '.join(given)} exclude each other: give one of them")
     if json and not episodes:
         raise ValueError("json is of scores: give episodes too, or leave it out")
     _, act, card = acting(task, policy, device)

@@ -141,8 +141,8 @@ def play_file(
 def play_press(
     settings: dict, page: Page | None = None, rounds: float = np.inf, speed: float = 0.1, **server: object
 ) -> Page:
-    """Shows a press in a loop, slowly; sliders set depth and location, and start a new press when they are
-    moved. Returns the page.
+    """Shows a press in slow motion, in a loop. Sliders set depth and location; moving one starts a new
+    press. Returns the page.
 
     Args:
       settings: of the press except depth and location, as for `PressOptions`.

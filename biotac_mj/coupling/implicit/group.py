@@ -284,7 +284,7 @@ class SkinGroup:
         return (self.correction + self.arrays.wrench).ravel() @ self._rows
 
     def use_euler(self) -> None:
-        """Makes the step of the bodies of greedy skins that of backward Euler."""
+        """Steps by backward Euler where a skin would give more energy than it stores."""
         self._use_euler()
         self.written = False
 

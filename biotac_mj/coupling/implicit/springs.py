@@ -1,5 +1,5 @@
-"""Stiffness of bodies in one mjData other than that of the skin that pushes them: their inertia, and MuJoCo's
-constraints as its solver left them. A contact that slides holds by the Hessian of its elliptic cone."""
+"""What resists the motion of bodies in one mjData besides the skins: inertia, and MuJoCo's constraints in the
+states that its solver found. A sliding contact resists by the Hessian of its elliptic cone."""
 
 from collections.abc import Sequence
 

@@ -60,7 +60,7 @@ class World:
         self._stage, self._began = 1, np.nan  # of Runge-Kutta's step
         self._acting, self._now = False, None  # whether bodies are under way, and from where
         self._weights = None  # of the rows, which one of Runge-Kutta's stages has taken
-        self._held_trees = np.zeros(model.ntree, bool)  # see `_go_on`
+        self._held_trees = np.zeros(model.ntree, bool)  # see `_apply_first_stage`
         self._loads = None
         self._solids = {i: SolidContacts(model, one.touching) for i, one in self.instances.items()}
         # whether the integrator's accelerations differ from the constraint solver's in this step
@@ -96,7 +96,7 @@ class World:
                     other.refuse_foreign_state(error)
                 raise
         elif index == self.first:
-            self._go_on()
+            self._apply_first_stage()
 
     def _end_stage(self):
         for instance in self.instances.values():
@@ -272,7 +272,7 @@ class World:
         force[self._group.metric.numbers] = 0.0
         return self.data.pushed_by(force)
 
-    def _go_on(self):
+    def _apply_first_stage(self):
         """Lets the forces of the skins, and of MuJoCo's contacts, limits and friction on trees that they
         touch, that the first of Runge-Kutta's stages found act in this one: all were found for the whole
         step, and do not hold where a stage has the bodies. All other forces are those of the stage: equality
@@ -309,7 +309,7 @@ class World:
             self._leave_constraint_forces()
         moved = 0.5 * self.model.opt.timestep * (self._began_with + self.data.qvel)
         after = self.data.qpos.copy()
-        self.data.go_on(self.coupled[0].lead)
+        self.data.integrate_positions(self.coupled[0].lead)
         self.data.find_poses()
         if acting:
             self._group.settle(moved, ASTRAY)

@@ -143,8 +143,8 @@ class PlateDiagnosis(RecordingDiagnosis):
     named: list[Tried]
 
     def table(self) -> Table:
-        """What each model takes away of the squared error of the worst electrodes, with dots for those that
-        are named."""
+        """Percentage of the worst electrodes' squared error that each model explains, with dots at the named
+        models."""
         closed = [[100 * t.closed(s.worst) for s, t in zip(self.sensors, f.tested)] for f in self.models]
         dots = [(self.models.index(f), i) for f in self.named for i in range(len(self.sensors))]
         return Table(

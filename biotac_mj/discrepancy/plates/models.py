@@ -11,7 +11,7 @@ from ...matching.response import Response
 from ...matching.states import frame
 from ...sensor.channels import counts_from_log_impedance
 from ..recordings.recording import PlainRecording
-from ..trajectories.likelihood import Likelihood, courses, kernel
+from ..trajectories.likelihood import Likelihood, error_modes, kernel
 from ..trajectories.settings import SETTINGS
 
 _SETUP = Setup(gains=0.0, amount=1.0)  # of the changes that a response has
@@ -96,7 +96,7 @@ def fitted(
     contact = _contact(response, rows, match, const.modulus, len(recording) / recording.rate)
     every = [np.arange(len(rows))[some]]
     groups = [slice(0, len(noise) - 2), slice(len(noise) - 2, len(noise))]
-    own = Likelihood(kernel([contact], every), courses([contact], every), noise, groups, largest)
+    own = Likelihood(kernel([contact], every), error_modes([contact], every), noise, groups, largest)
     done = [] if base is None else [columns[-1] * away[-1]]  # by the effect
     columns, here = own.turned(columns), own.turned(residual)
     y = here + np.tensordot(away, columns, 1)  # as from the priors' means

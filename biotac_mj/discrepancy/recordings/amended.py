@@ -53,13 +53,13 @@ def _warming(session, rest):
     rows, time = np.linspace(0, session.fit.sum() - 1, 200).astype(int), session.recording.time
     warm = next((f for f in drifts if f.id == "warmup"), None)
 
-    def course(found):
+    def drift_of(found):
         counts = np.tile(rest, (len(time), 1))
         for finding in found:
             counts = finding.correct(counts, time)
         return log_impedance(rest) - log_impedance(counts[rows])
 
-    every, others = course(drifts), course([f for f in drifts if f is not warm])
+    every, others = drift_of(drifts), drift_of([f for f in drifts if f is not warm])
     largest = every[:, np.ptp(every, axis=0).argmax()]
     said = warm.parameters if warm else KINDS["warmup"].of_trend(time[rows], largest, None, None)
     a, tau = said["a"][0] or 1e-9, said["tau"][0]

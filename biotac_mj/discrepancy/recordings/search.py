@@ -222,8 +222,8 @@ def _beside(session):
     than two."""
     single = [f for f in session.findings if not f.of_all]
     others = [f for f in single if not (f.kind.drifts or f.kind.in_noise or f.kind.is_noise)]
-    told = {k for f in others for k in f.channels}
-    return [f for f in single if f.kind.drifts and told.intersection(f.channels)]
+    drifting = {k for f in others for k in f.channels}
+    return [f for f in single if f.kind.drifts and drifting.intersection(f.channels)]
 
 
 def _everywhere(finding, counts):

@@ -341,10 +341,10 @@ class Verdict:
                 begin = "No difference is larger than the comparison itself may be off by"
             return f"{begin}; the largest difference is in {gap.name}, {size}."
         text = f"The largest gap is in {gap.name}, {size}"
-        added, told = {}, set()
+        added, named = {}, set()
         for f in self.effects:  # one of several that tie speaks for all
-            if f.id not in told and f.confirmed is not False:
-                added[f.title], told = None, told | f.ties.keys()
+            if f.id not in named and f.confirmed is not False:
+                added[f.title], named = None, named | f.ties.keys()
         what = " and ".join(added) or " and ".join(f.title for f in self.effects)
         if not self.effects:
             return f"{text}; no known cause is sure enough for a name."

@@ -250,8 +250,8 @@ def believed(comparison: Comparison, search: Search, contacts: int) -> Beliefs:
     base model alone."""
     fits = list(search.fits.values())
     posed = np.array([_posed(comparison, fit, fits) for fit in fits])
-    told = [fit.told for fit in fits] - posed + posed * contacts / _CONTACTS
-    probable = weights(told, [len(fit.effects) for fit in fits], contacts)
+    evidence = [fit.own_evidence for fit in fits] - posed + posed * contacts / _CONTACTS
+    probable = weights(evidence, [len(fit.effects) for fit in fits], contacts)
     likely = set(np.argsort(-probable)[:_MOST])
     out = [
         Explanation(fit.effects, fit.nuisance, fit.score, fit.information, float(weight))
@@ -278,7 +278,7 @@ def _posed(comparison, fit, fits):
     plain = [f for f in fits if not any(e.pose_offset for e, _ in f.effects)]
     rivals = [f for f in plain if f.score >= fit.score or {e.id for e, _ in f.effects} <= others]
     least = min(f.scatter(comparison) for f in rivals)
-    return min(max(least - fit.scatter(comparison), 0.0), max(fit.told, 0.0))
+    return min(max(least - fit.scatter(comparison), 0.0), max(fit.own_evidence, 0.0))
 
 
 def _unseen(explanations, search):

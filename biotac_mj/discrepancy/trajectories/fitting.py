@@ -32,9 +32,9 @@ class Fit:
     Attributes:
       effects: list of (Effect, theta). nuisance: fitted with them. names: of the free parameters: (effect
       id, name); covariance: theirs.
-      score: log evidence of the data for these effects [nats]. told: evidence over none [nats] that tells
-      these effects from what the laws of others lack. overlap: of where the last effect acts with where each
-      of the others does, 0 to 1 each, in sum. amplitude: (width,) by how many times more
+      score: log evidence of the data for these effects [nats]. own_evidence: evidence [nats] over no effect
+      that errors in the laws of other effects cannot explain. overlap: of where the last effect acts with
+      where each of the others does, 0 to 1 each, in sum. amplitude: (width,) by how many times more
       than `size` (width,) [counts, N], which is what is expected of a base model, the model with them is off;
       off: (width,) the same beside what the laws of the effects may lack.
       modulus_error: standard error of the logarithm of the modulus.
@@ -59,10 +59,10 @@ class Fit:
     y: np.ndarray | None = None
     columns: np.ndarray | None = None
     offsets: np.ndarray | None = None
-    told: float = 0.0
+    own_evidence: float = 0.0
 
     def posed(self, comparison: "Comparison") -> list:
-        """Residuals (n, width) over noise and resolution, poses where they most probably are."""
+        """Residuals (n, width) over noise and resolution, at the most probable poses."""
         raw = comparison.raw(self.effects, self.nuisance, offsets=self.offsets)
         return [r / s for r, s in zip(raw, comparison.sigmas)]
 
@@ -274,11 +274,11 @@ class _Model:
     def _lawful(self, columns, weights, law_errors):
         """Columns of parameters beside what the laws of their effects lack by these weights: where an effect
         does more, there is more of that, too."""
-        columns, count = columns.copy(), likelihood.COURSES
+        columns, count = columns.copy(), likelihood.ERROR_MODES
         for j, (k, *_) in enumerate(self.parameters):
             if k is not None:
                 own = law_errors[k] * weights[k * count : (k + 1) * count]
-                columns[j] = self.likelihood.times(1 + own @ self.likelihood.courses, columns[j])
+                columns[j] = self.likelihood.times(1 + own @ self.likelihood.error_modes, columns[j])
         return columns
 
     def _offsets(self, weights):

@@ -35,7 +35,7 @@ _TOUCH = 20e-6  # [m]
 # is much better than it was found to be elsewhere.
 _FACTORS = np.exp(np.arange(-0.4, 4.01, 0.4))
 _LAW_FACTORS = np.exp(np.arange(-1.2, 1.61, 0.2))  # of law errors, in their prior's median
-COURSES = 24  # along which the law of an effect may be another
+ERROR_MODES = 24  # along which the law of an effect may be another
 _LAW_PLACE = 10e-3  # [m] along the finger, over which a law is nearly the same
 
 
@@ -59,7 +59,7 @@ def kernel(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
     return touched + _DRIFTING * np.exp(-0.5 * clock)
 
 
-def courses(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
+def error_modes(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
     """(k, n) functions of depth, time since touch, the session's clock, place and tool whose sum with
     coefficients of unit variance is the process of a law's error."""
     away = _distances(_gathered(data, rows, lambda t: t.depth), _DEPTH)
@@ -67,7 +67,7 @@ def courses(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
     away += _distances(_gathered(data, rows, lambda t: t.clock + t.time), _CLOCK)
     away += _distances(_gathered(data, rows, lambda t: t.pos), _LAW_PLACE)
     values, vectors = np.linalg.eigh(_same_tool(data, rows) * np.exp(-0.5 * away))
-    return (np.sqrt(np.maximum(values, 0.0)) * vectors).T[: -COURSES - 1 : -1]
+    return (np.sqrt(np.maximum(values, 0.0)) * vectors).T[: -ERROR_MODES - 1 : -1]
 
 
 def _same_tool(data, rows):
@@ -96,14 +96,14 @@ class Likelihood:
 
     Attributes:
       groups: slices of channels whose errors have something in common. noise: (width,) its standard deviation
-        [counts, N]. courses: (k, n) of errors of laws. size: (width,) by how much the base model is expected
-        to be off [counts, N] under the deepest press.
+        [counts, N]. error_modes: (k, n) of errors of laws. size: (width,) expected error of the base model
+        [counts, N] under the deepest press.
     """
 
     def __init__(
         self,
         covariance: np.ndarray,
-        courses: np.ndarray,
+        error_modes: np.ndarray,
         noise: np.ndarray,
         groups: list[slice],
         largest: np.ndarray,
@@ -112,7 +112,7 @@ class Likelihood:
         each channel."""
         values, vectors = np.linalg.eigh(covariance)
         self._scale, self._vectors = np.maximum(values, 0.0), vectors
-        self.courses, self.noise, self.groups = courses, noise, groups
+        self.error_modes, self.noise, self.groups = error_modes, noise, groups
         self.size = np.concatenate(
             [np.full(s.stop - s.start, SETTINGS.resolution * _upper(largest[s])) for s in groups]
         )
@@ -129,22 +129,22 @@ class Likelihood:
         """(m, n, width) what errors of laws do, of one standard deviation each, in the eigenvectors; changes:
         (n, width) what each effect does, errors (effects,): of its law."""
         out = [
-            self.turned(error * change * course[:, None])
+            self.turned(error * change * mode[:, None])
             for change, error in zip(changes, errors)
-            for course in self.courses
+            for mode in self.error_modes
         ]
-        return np.array(out).reshape(len(out), len(self.courses[0]), len(self.size))
+        return np.array(out).reshape(len(out), len(self.error_modes[0]), len(self.size))
 
     def law_errors(
         self, errors: np.ndarray, weights: np.ndarray, factor: np.ndarray, begin: int
     ) -> np.ndarray:
         """(effects,) most probable errors of laws, by what `evidence` gave with errors (effects,): weights
         (m,) and the factor of their precision, those of laws from `begin` on."""
-        rows = slice(begin, begin + len(errors) * COURSES)
+        rows = slice(begin, begin + len(errors) * ERROR_MODES)
         expected = weights[rows] ** 2 + (np.linalg.inv(factor)[:, rows] ** 2).sum(0)
-        square = errors[:, None] ** 2 * expected.reshape(len(errors), COURSES)
+        square = errors[:, None] ** 2 * expected.reshape(len(errors), ERROR_MODES)
         log = np.log(SETTINGS.law * _LAW_FACTORS)
-        fits = -COURSES * log - 0.5 * square.sum(1)[:, None] * np.exp(-2 * log)
+        fits = -ERROR_MODES * log - 0.5 * square.sum(1)[:, None] * np.exp(-2 * log)
         return np.exp(log[(fits + _law_prior(log)).argmax(1)])
 
     def variance(self, amplitude: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -224,7 +224,7 @@ class TrajectoryLikelihood(Likelihood):
         self._resting[comparison.groups.get("force", slice(0))] = 0.0
         super().__init__(
             kernel(data, self._rows) * (side[:, None] == side),
-            courses(data, self._rows),
+            error_modes(data, self._rows),
             comparison.noises,
             list(comparison.groups.values()),
             np.abs(self.stacked(comparison.measured)).max(0),

@@ -94,8 +94,8 @@ def proved(comparison: "Comparison", null: "Fit", current: "Fit", aside: np.ndar
         least, most = _closed(comparison, begin, end, SETTINGS.law, aside)
     # what a law lacks is in part taken for errors of poses and of the base
     law = SETTINGS.law if any(not effect.wiring for effect, _ in current.effects) else 0.0
-    told = most - least <= 2 * SETTINGS.law
-    closed = 1 - float(np.hypot(1 - most, law)) if told else np.nan
+    narrow = most - least <= 2 * SETTINGS.law
+    closed = 1 - float(np.hypot(1 - most, law)) if narrow else np.nan
     within = max(least - law, 0.0), min(most + law, 1.0)
     return Proof(current, before, after, (first, last), closed, within)
 

@@ -17,8 +17,8 @@ if typing.TYPE_CHECKING:
     from .whitening import Comparison
 
 _ASTRAY = 0.25  # of the trajectories, that may be off whatever is named
-# Mean square of one trajectory that another equilibrium at an edge does not explain: at most 5.2 in 41
-# contacts of sensors with no effect, 28 where one of eleven presses was deep enough for rubber that stiffens.
+# Mean square of one trajectory above a second equilibrium at an edge, which gave at most 5.2 in 41 contacts
+# of sensors without effects; rubber that stiffens gave 28 in the only deep press of eleven.
 _FAR = 10.0
 _SEEN = 3.0  # [nats] of all trajectories together, with which an effect can be seen
 _OFF = 2.5  # mean square from which on a trajectory is off

@@ -106,13 +106,13 @@ def _other_shapes(comparison, one, current, chosen):
         if fit.score > best.score and not effect.rejection_reason(fit.effects[-1][1]):
             best = fit
     gain = one.gain + float(best.score - one.fit.score)
-    return _with_told(best, current, gain), gain
+    return _with_own_evidence(best, current, gain), gain
 
 
-def _with_told(fit, current, gain) -> Fit:
-    """The Fit with what its evidence beside `current` tells: what the laws of other effects lack makes
-    evidence for one that acts where they do."""
-    return dataclasses.replace(fit, told=current.told + gain / (1 + fit.overlap))
+def _with_own_evidence(fit, current, gain) -> Fit:
+    """The Fit with the evidence that is its own: an effect that acts where others do also explains errors of
+    their laws, so its gain counts less by the overlap."""
+    return dataclasses.replace(fit, own_evidence=current.own_evidence + gain / (1 + fit.overlap))
 
 
 def _round(comparison, search, usable, chosen, bar):
@@ -175,7 +175,7 @@ def _candidate(comparison, effect, fit, current, usable):
     rejections += [doubt] if (doubt := effect.rejection_reason(theta)) else []
     rejections += ["undone"] if effect.undoes(theta, fit.nuisance.log_modulus) else []
     rejections += ["little"] if _little(comparison, effect, theta) else []
-    return Candidate(effect, _with_told(fit, current, gain), gain, p, rejections)
+    return Candidate(effect, _with_own_evidence(fit, current, gain), gain, p, rejections)
 
 
 def _little(comparison, effect, theta) -> bool:

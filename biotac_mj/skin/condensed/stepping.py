@@ -447,7 +447,7 @@ def _conclude_pass(
 
 
 @wp.func
-def _go_on(most: real, p: LoadStepping, o: Increment):
+def _advance_load(most: real, p: LoadStepping, o: Increment):
     """Accepts or cuts back the load increment, and chooses the next; returns whether there is one."""
     on = int(1)
     if p.holds == 1:
@@ -511,7 +511,7 @@ def conclude_balance(
         for i in range(t, s.x.shape[0], wp.block_dim()):
             s.x[i, w] = s.touch.x_last[i, w]
         sync()
-    p, on = _go_on(s.most[w], p, o)
+    p, on = _advance_load(s.most[w], p, o)
     if on == 1:
         if t == 0:
             s.solve.stepping[w] = _begin_increment(p, s.most[w])

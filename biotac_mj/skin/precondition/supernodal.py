@@ -28,8 +28,8 @@ _LANES = 8  # numbers of a SIMD multiplication, to which rows of panels are padd
 _TOGETHER = 4  # nodes whose rows are computed together, since right-hand sides share reading the panels
 _FEW = 16  # right-hand sides up to which a launch is cached: packing its arguments is a third of a solve
 
-# Both sweeps for all right-hand sides, with four rows of a panel and up to four sides at a time, which share
-# reading and conversion. The sums of a side do not depend on the other sides.
+# Both sweeps for all right-hand sides. Four rows of a panel are read and converted once for up to four
+# right-hand sides; the sums of one do not depend on the others.
 _SWEEPS = """
     typedef float narrow __attribute__((vector_size(32), aligned(4)));
     typedef double lanes __attribute__((vector_size(64), aligned(8)));

@@ -133,9 +133,9 @@ def gymnasium_env(env: BatchTask) -> "gymnasium.vector.VectorEnv":
                 final = np.full(env.num_envs, None, object)
                 for world in np.flatnonzero(done):
                     final[world] = seen[world]
-                told = {name: np.where(done, value, np.zeros_like(value)) for name, value in info.items()}
-                told |= {f"_{name}": done for name in info}
-                info |= {"final_obs": final, "final_info": told, "_final_obs": done, "_final_info": done}
+                ended = {name: np.where(done, value, np.zeros_like(value)) for name, value in info.items()}
+                ended |= {f"_{name}": done for name in info}
+                info |= {"final_obs": final, "final_info": ended, "_final_obs": done, "_final_info": done}
             return (_policy(observations).cpu().numpy(), *(x.cpu().numpy() for x in others), info)
 
         __reduce__ = BatchTask.__reduce__

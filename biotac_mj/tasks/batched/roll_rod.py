@@ -143,7 +143,7 @@ class RollRod(HeldTask):
         self._place_before[:] = place
         return self._roll(self._target - coming)
 
-    def aim_anew(self, sensed: dict, wish: torch.Tensor) -> tuple[dict, torch.Tensor]:
+    def change_goal(self, sensed: dict, wish: torch.Tensor) -> tuple[dict, torch.Tensor]:
         body, target = sensed["body"].clone(), self._uniform(*self.cfg.target, len(wish))
         off = target - 1e-3 * body[:, 0, _TARGET]
         body[..., _TARGET] = 1e3 * target[:, None]

@@ -227,7 +227,7 @@ class BatchTask(abc.ABC):
         """Actions (num_envs, num_actions), of which -1 to 1 counts, of a controller that uses the true state
         and solves the task."""
 
-    def aim_anew(self, sensed: dict, wish: torch.Tensor) -> tuple[dict, torch.Tensor]:
+    def change_goal(self, sensed: dict, wish: torch.Tensor) -> tuple[dict, torch.Tensor]:
         """What was `sensed` in n worlds, and what the script wished to do there (n, num_actions), with other
         goals, where the task has observed ones."""
         return sensed, wish

@@ -269,7 +269,7 @@ def _study(learners, lessons, errors, acted, progress):
     there was tells where the object was believed to be."""
     numbers, env, begin = learners[0].learner.numbers, learners[0].env, time.perf_counter()
     for _ in range(numbers.lessons):
-        sensed, right = env.aim_anew(*lessons.draw(numbers.several))
+        sensed, right = env.change_goal(*lessons.draw(numbers.several))
         draw = functools.cache(functools.partial(env.sense_anew, **sensed, **errors, missing=_MISSING))
         for run in learners:
             run.learner.imitate(draw(run.observe), right.clamp(-1, 1), progress)

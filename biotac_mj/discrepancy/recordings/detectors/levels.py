@@ -293,8 +293,8 @@ def _name_shared(session, finding, trend, change):
     # what comes slowly is the session's whatever its pattern: electrodes have shares of their own of it
     alike = [e for e in order if e.drifts and not sudden or misfit[e.id] < 2 * min(misfit.values()) + 12]
     time = np.linspace(trend.knots[0], trend.knots[-1], 200)
-    course = time, trend(time) - trend(time[:1])
-    found = {e.id: e.of_trend(*course, m.slope, middle) for e in alike}
+    samples = time, trend(time) - trend(time[:1])
+    found = {e.id: e.of_trend(*samples, m.slope, middle) for e in alike}
     best, *ties = [e for e in alike if e.possible(found[e.id])] or alike
     finding.id, finding.parameters, ties = best.id, found[best.id], [e.id for e in ties]
     finding.detector = alike[0].detector  # by which way all go, whatever is possible

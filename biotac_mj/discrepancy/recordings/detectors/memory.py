@@ -21,7 +21,7 @@ from ..session import Session
 
 _BIN = 0.05  # [s]
 _PIECE = 1.0  # [s] of a piece that is left out
-_KNOTS = 60.0  # [s] between knots of the rest's course
+_KNOTS = 60.0  # [s] between knots of the baseline
 _TAUS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # [s]: what is slower is not told from drift
 _FILTERS = (0.06, 0.12, 0.25, 0.5)  # [s]
 _PLAYS = (0.1, 0.2, 0.4)  # of a channel's largest changes
@@ -56,8 +56,8 @@ def remembered(session: Session, free: np.ndarray) -> Candidate | None:
     z = log_impedance(session.counts[: m * width][:, used]).reshape(m, width, -1).mean(1)
     time, rate = (np.arange(m) + 0.5) * width / r.rate, r.rate / width
     knots = np.linspace(0, time[-1], 2 + int(time[-1] / _KNOTS))
-    course = np.stack([np.interp(time, knots, row) for row in np.eye(len(knots))], axis=1)
-    change = z - course @ np.linalg.lstsq(course[free], z[free], rcond=None)[0]
+    baseline = np.stack([np.interp(time, knots, row) for row in np.eye(len(knots))], axis=1)
+    change = z - baseline @ np.linalg.lstsq(baseline[free], z[free], rcond=None)[0]
     change[free | (time < time[begin])] = 0.0  # what touches did: by what came of itself nothing is explained
     if not change.any():
         return None
@@ -66,7 +66,7 @@ def remembered(session: Session, free: np.ndarray) -> Candidate | None:
     laws = [law for x, by in ((change, 1.0), (load, press)) for law in _laws(x, by, rate)]
     piece = (np.cumsum(np.diff(free, prepend=False)) + time // _PIECE).astype(int) % BLOCKS
     rounding = ROUNDING / slope_of(session.counts[:, used]) / np.sqrt(width)
-    seen = _Rest(z[free], course[free], piece[free], rounding**2)
+    seen = _Rest(z[free], baseline[free], piece[free], rounding**2)
     tried = sorted(
         ((*seen.gain(law.values[free], law.whole), law) for law in laws), key=lambda one: -one[0].sum()
     )
@@ -77,7 +77,7 @@ def remembered(session: Session, free: np.ndarray) -> Candidate | None:
     if fraction < _LEAST or p > _P or gain.sum() <= np.log(ODDS * len(tried)):
         return None
     values = best.shape | ({} if best.whole else {best.size: fraction})
-    kin = tuple(KINDS[best.id].equivalents)  # no log tells one law from those
+    equivalents = tuple(KINDS[best.id].equivalents)  # no log tells one law from those
     return Candidate(
         best.id,
         tuple(range(session.counts.shape[1])),
@@ -89,7 +89,7 @@ def remembered(session: Session, free: np.ndarray) -> Candidate | None:
         p=p,
         detector="memory",
         features={"nats": float(np.log1p(gain.sum())), "size": float(np.log(fraction / _LEAST))},
-        ties=(*kin, rival[2].id) if gain.sum() - rival[0].sum() < np.log(ODDS) else kin,
+        ties=(*equivalents, rival[2].id) if gain.sum() - rival[0].sum() < np.log(ODDS) else equivalents,
         verified=True,  # each piece by the others
     )
 
@@ -110,14 +110,14 @@ def _laws(x, by, rate):
 
 
 class _Rest:
-    """Levels y (n, c) while nothing touches, their course (n, k), the piece (n,) of each row, and the least
+    """Levels y (n, c) while nothing touches, their baseline (n, k), the piece (n,) of each row, and the least
     variance (c,) of noise."""
 
-    def __init__(self, y, course, piece, least):
+    def __init__(self, y, baseline, piece, least):
         self.rest = [piece != b for b in range(BLOCKS)]
-        self.fits = [np.linalg.pinv(course[rest], rcond=1e-6) for rest in self.rest]
-        self.course = course
-        self.left = [y - course @ (fit @ y[rest]) for fit, rest in zip(self.fits, self.rest)]
+        self.fits = [np.linalg.pinv(baseline[rest], rcond=1e-6) for rest in self.rest]
+        self.baseline = baseline
+        self.left = [y - baseline @ (fit @ y[rest]) for fit, rest in zip(self.fits, self.rest)]
         self.square = (
             np.median(np.diff(y, axis=0) ** 2, axis=0) / chi2.median(1) + 2 * least
         )  # twice the noise's
@@ -127,7 +127,7 @@ class _Rest:
         the fraction."""
         gains, fractions = [], []
         for fit, rest, left in zip(self.fits, self.rest, self.left):
-            mine = law - self.course @ (fit @ law[rest])
+            mine = law - self.baseline @ (fit @ law[rest])
             fraction = (mine * left / self.square)[rest].sum() / (mine**2 / self.square)[rest].sum()
             fraction = 1.0 if whole else fraction
             before, after = ((e[~rest] ** 2).mean(0) for e in (left, left - fraction * mine))
