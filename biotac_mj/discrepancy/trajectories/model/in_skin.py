@@ -14,7 +14,7 @@ import numpy as np
 
 from ....effects.effect import Run
 from ....effects.in_film import RoughFilm, drain, remaining_liquid
-from ....effects.in_skin import memory_of, moduli
+from ....effects.in_skin import Inside, memory_of, moduli
 from ....sensor.film import FilmConduction
 from ....skin.model import SkinModel
 from ..trajectory import Trajectory
@@ -96,6 +96,7 @@ class InSkinSimulator(Simulator):
 
     tier: str = "full"
     constitutive: typing.ClassVar[str] = "in_skin"
+    inside: typing.ClassVar[Inside | None] = None  # what a copy's skin is solved with, see `run`
 
     def __post_init__(self):
         if self.tier != "full":
@@ -118,27 +119,14 @@ class InSkinSimulator(Simulator):
         inside = memory_of(effects)
         if exact is False or inside.rest == list(effects):  # nothing is inside
             return super().run(trajectories, fields, exact, effects, *more, **kw)
-        runs = _remembering(self, inside).run(trajectories, None, True, inside.rest, *more, **kw)
+        # nothing is cached, since the past decides
+        inner = self.but(cache=None, inside=inside)
+        runs = inner.run(trajectories, None, True, inside.rest, *more, **kw)
         if exact is True:
             return runs
         listed = set(np.atleast_1d(exact).tolist())
         others = super().run(trajectories, fields, False, effects, *more, **kw)
         return [runs[i] if i in listed else other for i, other in enumerate(others)]
-
-
-def _remembering(sim, inside):
-    """A simulator's skin with what is inside it."""
-    inner = _Remembering(**_settings(sim) | {"cache": None})
-    inner.inside, inner._models = inside, {}
-    return inner
-
-
-def _settings(sim):
-    return {f.name: getattr(sim, f.name) for f in dataclasses.fields(Simulator) if f.init}
-
-
-class _Remembering(Simulator):
-    """Solves the skin with what is `inside`; nothing is cached, since the past decides."""
 
     def solve(
         self,
@@ -149,6 +137,9 @@ class _Remembering(Simulator):
         bubble: float = 0.0,
         progress: Callable[[], object] | None = None,
     ) -> list:
+        """See `Solver.solve`."""
+        if self.inside is None:
+            return super().solve(trajectories, offset, log_radius, log_friction, bubble, progress)
         poses = placed(trajectories, offset, log_radius)
         model, film = self.skin_and_film(log_friction, bubble)
         power = self.inside.film.get("power")
@@ -156,10 +147,9 @@ class _Remembering(Simulator):
         loss, before = (self.inside.film.get(name, 0.0) for name in ("loss", "before"))
         return solve_with_memory(model, film, trajectories, poses, progress, loss, before)
 
-    def skin_and_film(self, log_friction, bubble):
-        from ....skin.model import SkinModel
-
-        if bubble not in self._models:
+    def skin_and_film(self, log_friction: float, bubble: float) -> tuple:
+        """See `Solver.skin_and_film`; with what is `inside`."""
+        if self.inside is not None and bubble not in self._models:
             super().skin_and_film(0.0, bubble)
             plain = self._models[bubble]
             rubber, options = self.inside.rubber(plain.material), self.inside.options(plain.options)
