@@ -765,7 +765,7 @@ def test_a_session_trend_is_told_from_place_and_load():
     warm = cells([(by_id("warmup"), {"a": -0.3, "tau": 60.0})])
     assert sum(c["condition"] == "clock" and c["channel"].startswith("e") for c in warm) >= 10
     soft = cells([(by_id("relax"), {"g": 0.4, "tau": 0.3})])
-    assert soft[0]["channel"] in ("force", "pdc") and not any(
+    assert soft[0]["channel"] in ("Fx", "Fy", "Fz", "pdc") and not any(
         c["channel"] == "e1" and c["condition"] == "clock" for c in soft
     )
 

@@ -39,10 +39,8 @@ def conditions(trajectories: "list[Trajectory]") -> dict:
 
     A weight of 1 asks for the mean residual of the rows, a centred one for its trend over trajectories.
     """
-    out = {name: [] for name in ("free", "approach", "hold", "slide", "unload")}
-    for t in trajectories:
-        for name, rows in phases(t).items():
-            out[name].append((rows, 1.0))
+    each = [phases(t) for t in trajectories]
+    out = {name: [(rows[name], 1.0) for rows in each] for name in each[0]}
     deepest = np.median([t.depth.max() for t in trajectories])
     out["deep"] = [(t.depth > 0.75 * deepest, 1.0) for t in trajectories]
     out["light"] = [((t.depth > 20e-6) & (t.depth < 0.4 * deepest), 1.0) for t in trajectories]
@@ -66,27 +64,19 @@ def conditions(trajectories: "list[Trajectory]") -> dict:
     return out
 
 
-def channel_groups(comparison: "Comparison") -> dict:
-    """name -> slice of the residual's columns: every electrode, PDC, force."""
-    return {
-        **{f"e{k + 1}": slice(k, k + 1) for k in range(comparison.nelectrode)},
-        **{k: s for k, s in comparison.groups.items() if k != "electrodes"},
-    }
-
-
 def residual_cells(
-    comparison: "Comparison", null: "Fit", chosen: np.ndarray, channels: dict[str, slice]
+    comparison: "Comparison", null: "Fit", chosen: np.ndarray
 ) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Residuals of the chosen trajectories, divided by noise and resolution: names of conditions, number of
     rows (trajectories, conditions), and means over these (trajectories, conditions, channels), nan where
-    there are none; channels: name -> columns."""
+    there are none."""
     white, asked = null.posed(comparison), conditions([comparison.trajectories[i] for i in chosen])
     rows = np.array([[part.sum() for part, _ in parts] for parts in asked.values()]).T
-    mean = np.full((*rows.shape, len(channels)), np.nan)
+    mean = np.full((*rows.shape, comparison.width), np.nan)
     for c, parts in enumerate(asked.values()):
         for u, (i, (some, weight)) in enumerate(zip(chosen, parts)):
             if some.any():
-                mean[u, c] = [weight * white[i][some, part].mean() for part in channels.values()]
+                mean[u, c] = weight * white[i][some].mean(0)
     return list(asked), rows, mean
 
 
@@ -101,9 +91,8 @@ def where(comparison: "Comparison", null: "Fit", chosen: np.ndarray) -> list[dic
 
     All trajectories share the error of the rest levels, which sign flips do not cover: a mean has to be three
     times that, a trend 0.3 sigma."""
-    groups = channel_groups(comparison)
-    names, rows, mean = residual_cells(comparison, null, chosen, groups)
-    statistic, channels = mean * np.sqrt(rows)[:, :, None], list(groups)
+    names, rows, mean = residual_cells(comparison, null, chosen)
+    statistic, channels = mean * np.sqrt(rows)[:, :, None], comparison.channels
     known = np.isfinite(statistic).sum(0) >= _FEWEST
     t, p = np.full((2, *known.shape), np.nan)
     if known.any():

@@ -75,13 +75,8 @@ class TrajectoryDiagnosis(Verdict):
         """Mean residual of the model without effects, in noise and resolution, or its trend over
         trajectories."""
         c = self.comparison
-        columns = {name: slice(k, k + 1) for k, name in enumerate(c.channels)}
-        asked, _, mean = residual_cells(c, self.null, self.selection, columns)
-        column = {"force": "Fy"}
-        dots = [
-            (asked.index(one["condition"]), c.channels.index(column.get(one["channel"], one["channel"])))
-            for one in self.where
-        ]
+        asked, _, mean = residual_cells(c, self.null, self.selection)
+        dots = [(asked.index(one["condition"]), c.channels.index(one["channel"])) for one in self.where]
         return Table(overall(mean), asked, c.channels, dots, "mean residual, or trend [sigma]")
 
     def sensor(self) -> SensorFile:
