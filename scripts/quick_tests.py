@@ -8,7 +8,7 @@ Quick are tests that cost at most `--cheap` seconds, and those that cost at most
 line or kernel of the package that no cheaper quick test runs. Tests of the same lines hold different things:
 the first case of a test function counts as ten lines more, that of a function marked `law` as sixty: lines do
 not tell what a test compares, so tests that hold a law of mechanics, or that two engines agree, have this
-mark. The tests that need a module share its compilation.
+mark. The tests that need a module or a fixture share its cost.
 """
 
 import argparse
@@ -35,15 +35,14 @@ def chosen(tests: dict[str, dict], line: float, cheap: float) -> tuple[set[str],
       line: the most that a test may cost for each line and kernel that it adds [s].
       cheap: what a test may cost that adds nothing [s].
     """
-    compilation = collections.defaultdict(float)  # of a variant, "module hash" [s]
+    shared = collections.defaultdict(float)  # [s], of modules that are compiled and of fixtures
     for row in tests.values():
-        for name, took in row["compiled"].items():
-            variant = " ".join(name.removeprefix("wp_").rsplit("_", 1))
-            compilation[variant] = max(compilation[variant], took)
-    needs = {name: [ran for ran in row["runs"] if ran in compilation] for name, row in tests.items()}
-    users = collections.Counter(module for modules in needs.values() for module in modules)
+        for name, took in row["shared"].items():
+            shared[name] = max(shared[name], took)
+    needs = {name: [ran for ran in row["runs"] if ran in shared] for name, row in tests.items()}
+    users = collections.Counter(thing for things in needs.values() for thing in things)
     cost = {
-        name: row["seconds"] + sum(compilation[module] / users[module] for module in needs[name])
+        name: row["seconds"] + sum(shared[thing] / users[thing] for thing in needs[name])
         for name, row in tests.items()
     }
     holds = {name: {ran for ran in row["runs"] if ran.startswith("biotac_mj")} for name, row in tests.items()}
@@ -63,8 +62,8 @@ def chosen(tests: dict[str, dict], line: float, cheap: float) -> tuple[set[str],
             continue
         quick.add(name)
         held |= holds[name]
-    compiled = {module for name in quick for module in needs[name]}
-    return quick, sum(tests[name]["seconds"] for name in quick) + sum(map(compilation.get, compiled))
+    used = {thing for name in quick for thing in needs[name]}
+    return quick, sum(tests[name]["seconds"] for name in quick) + sum(map(shared.get, used))
 
 
 def shortened(slow: set[str], quick: set[str]) -> list[str]:

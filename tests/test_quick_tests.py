@@ -6,8 +6,8 @@ import json
 from quick_tests import SLOW, chosen, measured, shortened
 
 
-def row(test, seconds, *runs, compiled=None, marks=()):
-    return {"test": test, "marks": marks, "seconds": seconds, "runs": list(runs), "compiled": compiled or {}}
+def row(test, seconds, *runs, shared=None, marks=()):
+    return {"test": test, "marks": marks, "seconds": seconds, "runs": list(runs), "shared": shared or {}}
 
 
 def lines(*numbers):
@@ -46,9 +46,9 @@ def test_a_law_is_worth_more_than_its_lines():
 
 
 def test_a_module_is_compiled_once_and_shared():
-    compiled = {"wp_m_12ab": 4.0}
+    shared = {"m 12ab": 4.0}
     runs = [f"biotac_mj/a.py:{i}" for i in range(15)]
-    rows = row("t::a", 0.1, *runs, "m 12ab", compiled=compiled), row("t::b", 0.2, *lines(20), "m 12ab")
+    rows = row("t::a", 0.1, *runs, "m 12ab", shared=shared), row("t::b", 0.2, *lines(20), "m 12ab")
     assert quick(*rows) == ({"t::a"}, 4.1)
     assert quick(*rows, line=0.2) == ({"t::a", "t::b"}, 4.1 + 0.2)
 
