@@ -40,9 +40,10 @@ def test_an_effect_that_helps_is_accepted_by_its_residuals(late):
     found = amended(null, LATE)
     proof = proved(comparison, null, found, ASIDE)
     assert proof.fit is found and proof.closed > 0.8
-    written = dataclasses.replace(found, nuisance=null.nuisance.written).raw(comparison, exact=ASIDE)
+    written = dataclasses.replace(found, nuisance=null.nuisance.written)
+    about, lines = comparison.posed(written.raw(comparison, ASIDE), written.effects, written.nuisance)
     for i, residual in zip(ASIDE, proof.residuals[1]):
-        np.testing.assert_array_equal(residual, comparison.unposed(i, written[i]))
+        np.testing.assert_array_equal(residual, about.unposed(i, lines[i]))
 
 
 def test_another_law_is_borne_out_and_a_wrong_effect_is_not(late):
@@ -85,13 +86,41 @@ def test_where_nothing_is_named_nothing_else_is_written():
 def test_errors_of_poses_are_taken_out_of_residuals(late):
     """Of poses that slip by as much as is stated, most of what that does is taken out, and noise stays."""
     comparison, null = late
-    written = dataclasses.replace(null, nuisance=null.nuisance.written).raw(comparison)
+    written = dataclasses.replace(null, nuisance=null.nuisance.written)
+    about, lines = comparison.posed(written.raw(comparison), [], written.nuisance)
     proof = proved(comparison, null, null, ASIDE)
     for i, residual in zip(ASIDE, proof.residuals[0]):
-        u, s, _ = comparison._basis[i]
-        along = u.T @ (written[i] / comparison.sigmas[i]).ravel()
+        u, s, _ = about._basis[i]
+        along = u.T @ (lines[i] / comparison.sigmas[i]).ravel()
         left = u.T @ (residual / comparison.sigmas[i]).ravel()
         np.testing.assert_allclose(left, along / (1 + s**2), atol=1e-9)
+
+
+class Stopped(Springs):
+    """Springs that meet something hard where the object is deepest."""
+
+    def solve(self, trajectories, offset=None, *args, **more):
+        out = super().solve(trajectories, offset, *args, **more)
+        for i, (t, one) in enumerate(zip(trajectories, out)):
+            by = 0.0 if offset is None else offset[i] @ t.heading
+            deeper = np.maximum((t.pos - t.pos[0]) @ t.heading + by - t.depth.max(), 0)
+            one["force"] = one["force"] - np.outer(2e4 * deeper, t.heading)
+        return out
+
+
+def test_a_pose_is_found_where_the_skin_meets_the_core():
+    """Straight lines from the recorded poses do not know of what a slip of 15 um meets."""
+    sim = Stopped()
+    data = measured([], modulus=1.0, of=sim, n=8)
+    comparison = about_rests(sim, data, sim.fields(data, progress=False), 2e-5)
+    raw = comparison.raw([])
+    about, lines = comparison.posed(raw, [], Nuisance())
+    force = comparison.groups["force"]
+    straight, found = (
+        [np.sqrt(np.mean(one.unposed(i, r[i])[:, force] ** 2)) for i in range(len(data))]
+        for one, r in ((comparison, raw), (about, lines))
+    )
+    assert max(straight) > 0.02 and max(found) < 0.007
 
 
 def test_what_is_left_beyond_resolution_is_not_of_the_base():

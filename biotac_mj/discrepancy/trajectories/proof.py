@@ -127,8 +127,8 @@ def _nearer(comparison, before, after, aside) -> bool:
 def _measured(comparison, fit, rows):
     """Numbers of a model as it is written, its residuals, see `Proof`, and its result of `_compared`."""
     written = dataclasses.replace(fit, nuisance=fit.nuisance.written)
-    raw, residual, beyond = _compared(comparison, written, rows)
-    out = {"mean_square": [float(np.sum(comparison.vector(i, raw[i]) ** 2)) for i in rows]}
+    square, residual, beyond = _compared(comparison, written, rows)
+    out = {"mean_square": square}
     for name, part in comparison.groups.items():
         out[name] = float(np.sqrt(np.mean([(r[:, part] ** 2).mean() for r in residual])))
     out["channels"] = np.sqrt(np.mean([(r**2).mean(0) for r in residual], axis=0)).tolist()
@@ -136,16 +136,17 @@ def _measured(comparison, fit, rows):
 
 
 def _compared(comparison, fit, rows):
-    """Residuals of all trajectories, the skin solved again in `rows`; those of `rows` without errors of their
-    poses; and the error of these, as a sum over rows of mean squares beyond noise.
+    """Mean squares of trajectories `rows`, the skin solved again; their residuals without errors of poses;
+    and the error of these, as a sum over rows of mean squares beyond noise.
 
     What all poses are off by is as much a disagreement as what is left of the channels: the most probable
     error of a pose counts in units of its repeatability, and each of its three numbers as much as a row."""
-    raw = fit.raw(comparison, exact=rows)
-    residual = [comparison.unposed(i, raw[i]) for i in rows]
+    about, raw = comparison.posed(fit.raw(comparison, exact=rows), fit.effects, fit.nuisance)
+    residual = [about.unposed(i, raw[i]) for i in rows]
     channels = sum((((r / comparison.noises) ** 2).mean(1) - 1).sum() for r in residual)
-    poses = sum((comparison.astray(i, raw[i]) ** 2 - 1).sum() for i in rows)
-    return raw, residual, float(channels + poses)
+    poses = sum((about.astray(i, raw[i]) ** 2 - 1).sum() for i in rows)
+    square = [float(np.sum(about.vector(i, raw[i]) ** 2)) for i in rows]
+    return square, residual, float(channels + poses)
 
 
 def _worse(comparison, before, after, aside) -> bool:

@@ -11,6 +11,8 @@ from .model.fields import Fields
 from .model.simulator import Simulator
 from .settings import SETTINGS
 
+_ITERATIONS = 3  # Gauss-Newton's, for an error of a pose
+_FARTHEST = 3.0  # times `repeatability`, at which its derivatives are taken
 # [m] of a pose from one trial to the next: a good stage with a remounted tool; pass your own
 REPEATABILITY = 0.05e-3
 
@@ -26,6 +28,7 @@ class Comparison:
     relative to their rest: the mean over all trajectories of row 0.
 
     modulus: of the base model as calibrated, a factor; J_i and S_b follow it (`calibrated`).
+    about: (trajectories, 3) errors of poses [m] at which J_i is taken; None: at the recorded poses (`posed`).
     noises: (width,) of the channels alone; sigma, sigmas: with the model's resolution, of all trajectories
     and of each.
     likelihoods: what `likelihood.of` has made of some of its trajectories.
@@ -37,6 +40,7 @@ class Comparison:
     noise: dict
     repeatability: float = REPEATABILITY
     modulus: float = 1.0
+    about: np.ndarray | None = None
 
     def __post_init__(self):
         free = np.array([t.electrodes[0] for t in self.trajectories])
@@ -85,7 +89,8 @@ class Comparison:
         """Computes, for every trajectory, an orthonormal basis u of its whitened pose columns, u s v' = J."""
         self._basis = []
         for i in range(len(self.trajectories)):
-            J = np.stack([(c / self.sigmas[i]).ravel() for c in self.moved(i)], axis=1)
+            at = 0.0 if self.about is None else self.about[i]
+            J = np.stack([(c / self.sigmas[i]).ravel() for c in self.moved(i, at)], axis=1)
             self._basis.append(np.linalg.svd(J * self.repeatability, full_matrices=False))
 
     def moved(self, i: int, offset: np.ndarray | float = 0.0) -> list[np.ndarray]:
@@ -122,11 +127,31 @@ class Comparison:
 
     def poses(self, effects: list, nuisance: Nuisance = KNOWN) -> np.ndarray:
         """(trajectories, 3) most probable error of every trial's pose [m], in the BioTac's frame."""
+        about, lines = self.posed(self.raw(effects, nuisance), effects, nuisance)
+        return about._errors(lines)
+
+    def _errors(self, residuals):
+        """(trajectories, 3) most probable errors of poses [m], by straight lines."""
         out = []
-        for i, r in enumerate(self.raw(effects, nuisance)):
+        for i, r in enumerate(residuals):
             _, s, v = self._basis[i]
             out.append(self.repeatability * v.T @ (s / (1 + s**2) * self._split(i, r)[0]))
         return np.array(out)
+
+    def posed(self, raw: list, effects: list, nuisance: Nuisance) -> tuple["Comparison", list[np.ndarray]]:
+        """The same with derivatives at the most probable error of every pose, and residuals `raw` (n, width)
+        of effects and nuisance as straight lines from there have them at the recorded poses: where the skin
+        meets the core within such an error, those from the recorded pose are others."""
+        out, lines, here = self, raw, self.raw(effects, nuisance)
+        for _ in range(_ITERATIONS):
+            about = out._errors(lines)
+            far = np.linalg.norm(about, axis=1, keepdims=True) / (_FARTHEST * self.repeatability)
+            about /= np.maximum(far, 1.0)
+            out = dataclasses.replace(self, about=about)
+            moved = self.raw(effects, nuisance, offsets=about)
+            straight = [np.tensordot(o, out.moved(i, o), 1) for i, o in enumerate(about)]
+            lines = [r + m - h + by for r, m, h, by in zip(raw, moved, here, straight)]
+        return out, lines
 
     def predict(self, runs: list) -> list:
         """Per trajectory (n, width) about rest."""
