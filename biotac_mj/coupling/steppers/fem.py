@@ -4,6 +4,7 @@ wrenches."""
 import copy
 import dataclasses
 import functools
+import math
 
 import numpy as np
 import warp as wp
@@ -26,6 +27,8 @@ from ..stepper import Geom, SkinResult, SkinStepper
 
 _WORK = 145  # of all solves of a two-way skin's step, see SkinOptions.max_work
 _MORE = 4  # times that at most, for rubber that keeps its volume
+# a third of a lone press's: two-way, the error of single steps is heard as chatter
+_TOLERANCE = 3e-4
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
 # [m]
 CLEAR = 1e-3
@@ -406,23 +409,24 @@ def skin_settings(config: Config) -> Settings:
       ValueError: a value that cannot be. FileNotFoundError: no such material or modulus.
     """
     mine = {name: config.options[name] for name in ("skin", "modulus") if name in config.options}
-    # a third of a lone press's tolerance: two-way, the error of single steps is heard as chatter
-    return read_settings(config.material, mine, tolerance=3e-4, liquid=config.liquid)
+    return read_settings(config.material, mine, tolerance=_TOLERANCE, liquid=config.liquid)
 
 
 def _in_time(config, settings):
     """Settings that bound the work of a step under two-way coupling, since the simulation waits for it."""
     rubber, options, modulus = settings
     if config.coupling == "two-way" and "max_work" not in config.options.get("skin", {}):
-        options = dataclasses.replace(options, max_work=_allowed(rubber.poissons_ratio))
+        options = dataclasses.replace(options, max_work=_allowed(rubber.poissons_ratio, options.tolerance))
     return Settings(rubber, options, modulus)
 
 
-def _allowed(nu):
+def _allowed(nu, tolerance):
     """Work of a step. The iterations of conjugate gradients grow as the square root of the ratio of bulk to
-    shear stiffness. A lower bound would save nothing: steps would reach it without an equilibrium."""
+    shear stiffness; where skin slips, Newton's method gains digits at a constant rate. A lower bound would
+    save nothing: steps would reach it without an equilibrium."""
     stiffer = max(nu, 0.0) / (1 - 2 * nu)
-    return round(_WORK * min(max(stiffer**0.5, 1.0), _MORE))
+    digits = math.log(tolerance) / math.log(_TOLERANCE)
+    return round(_WORK * min(max(stiffer**0.5, 1.0), _MORE) * max(digits, 1.0))
 
 
 def _filled(options):
