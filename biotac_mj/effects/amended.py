@@ -116,7 +116,7 @@ def amend(model: Model, effects: Effects) -> Model:
         given = options.get("skin")
         if not isinstance(given, SkinOptions):
             given = SkinOptions(**read_dict(given, "options['skin']"))
-        options["skin"] = plain(_with_liquid(inside.options(given), whole, skin_reference(skin)[1]))
+        options["skin"] = plain(with_liquid(inside.options(given), whole, skin_reference(skin)[1]))
     if inside.model:
         given = read_modulus(options.get("modulus"))
         options["modulus"] = plain(moduli(given, inside.model["modulus"], skin_reference(skin)[1]))
@@ -138,7 +138,7 @@ def amend_settings(given: dict, kind: type, effects: Effects) -> dict:
     return {**given, **{name: plain(getattr(out, name)) for name in names}}
 
 
-def _with_liquid(options, whole, geometry):
+def with_liquid(options: SkinOptions, whole: Whole, geometry: SkinGeometry) -> SkinOptions:
     """SkinOptions with the air in the liquid and without the lost part of it."""
     liquid, changes = _liquid(geometry), {}
     if whole.air:  # liquid and air in series: V / K + V0 / p0

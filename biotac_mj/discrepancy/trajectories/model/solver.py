@@ -10,6 +10,8 @@ import numpy as np
 
 from ....cache import Entry
 from ....data.objects import make_object
+from ....effects.amended import with_liquid
+from ....effects.effect import Whole
 from ....fields import check_types
 from ....geometry.design import Design
 from ....geometry.skins import design_of, load_skin
@@ -23,7 +25,6 @@ if typing.TYPE_CHECKING:
     from ....sensor.film import FilmConduction
 
 TIERS = ("condensed", "full")
-_AIR = 101325.0  # [Pa]
 _WORLDS = 64  # trajectories solved at once
 _LAST = weakref.WeakKeyDictionary()  # what a skin was solved for last, and its fields
 # what changes a sensor's answer to a touch, or its course in time: comparisons about the rest see no other
@@ -203,11 +204,7 @@ class Solver:
             geometry = load_skin(self.skin)
             rubber, options, modulus = self._read(liquid=True)[0]
             if bubble:
-                volume = store[0.0].liquid_volume if 0.0 in store else 366e-9
-                # liquid and air in series: V / K + V0 / p0
-                options = dataclasses.replace(
-                    options, bulk_modulus=1 / (1 / options.bulk_modulus + bubble / (_AIR * volume))
-                )
+                options = with_liquid(options, Whole(air=bubble), geometry)
             device = "cpu" if self.tier == "condensed" else self.device
             model = store[bubble] = SkinModel(geometry, rubber, options, device, modulus=modulus)
         model = store[bubble]
