@@ -172,14 +172,10 @@ def _of_poses(args: argparse.Namespace, recordings: "Sequence[Recording]") -> No
         )
     # run again after an interruption, or in a further round
     home = pathlib.Path(args.earlier[0]) if args.earlier else out
-    changes = {"device": args.device, "cache": str(home / "fields")}
-    if args.skin:
-        changes["skin"] = args.skin
-    if args.material:
-        changes["material"] = args.material
+    given = {name: getattr(args, name) for name in ("skin", "material", "options") if getattr(args, name)}
     if args.options:
-        changes["options"] = read_dict(args.options, "options")
-    sim = dataclasses.replace(sim, **changes)
+        given["options"] = read_dict(args.options, "options")
+    sim = dataclasses.replace(sim, device=args.device, cache=str(home / "fields"), **given)
     if args.device != "cpu" and sim.tier != "full":
         raise ValueError(f"--device {args.device} is for the full tier: add --tier full, or leave it out")
     if recordings:
@@ -188,7 +184,7 @@ def _of_poses(args: argparse.Namespace, recordings: "Sequence[Recording]") -> No
     report = workflow.diagnose(
         sim,
         data,
-        repeatability=args.repeatability if args.repeatability else REPEATABILITY,
+        repeatability=args.repeatability or REPEATABILITY,
         locked=0.25 if args.locked is None else args.locked,
         progress=not args.quiet,
     )
