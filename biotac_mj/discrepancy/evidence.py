@@ -4,6 +4,8 @@ import numpy as np
 from scipy.special import stdtr
 from scipy.stats import false_discovery_control
 
+from ..quality.evidence import signs
+
 RATE = 1 / 21  # of false discoveries
 ODDS = (1 - RATE) / RATE  # how much likelier than all else an explanation has to be
 
@@ -69,7 +71,7 @@ def signed_root_t(gain: np.ndarray) -> float:
     return float(stdtr(len(root) - 1, -root.mean() / error))
 
 
-def max_t(statistic: np.ndarray, draws: int = 2000) -> tuple[np.ndarray, np.ndarray]:
+def max_t(statistic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Family-wise p of many cells by sign flips of whole units (Andreella and Finos 2026; max-T of Westfall
     and Young).
 
@@ -85,7 +87,5 @@ def max_t(statistic: np.ndarray, draws: int = 2000) -> tuple[np.ndarray, np.ndar
     x = np.where(known, x, 0.0)
     scale = np.sqrt(np.maximum((x**2).sum(0), 1e-30))
     t = x.sum(0) / scale
-    sign = np.random.default_rng(0).choice([-1.0, 1.0], (draws, len(x)))
-    sign[0] = 1
-    largest = np.abs(sign @ x / scale).max(1)
+    largest = np.abs(signs(len(x)) @ x / scale).max(1)
     return t, np.array([np.mean(largest >= abs(v) - 1e-12) for v in t])

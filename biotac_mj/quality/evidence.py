@@ -25,11 +25,11 @@ def sign_flip(gain: np.ndarray) -> float:
     """p of mean(gain) > 0 under random signs. gain: (n,), one per block or trajectory. Exact for n <= 12."""
     gain = np.asarray(gain, float)
     n = len(gain)
-    return float(np.mean(_signs(n) @ gain >= gain.sum() - 1e-12 * np.abs(gain).sum()))
+    return float(np.mean(signs(n) @ gain >= gain.sum() - 1e-12 * np.abs(gain).sum()))
 
 
 @functools.lru_cache(maxsize=8)
-def _signs(n):
+def signs(n: int) -> np.ndarray:
     """(draws, n) of -1 and 1; all combinations for n <= 12."""
     if n <= 12:
         return 1.0 - 2 * ((np.arange(2**n)[:, None] >> np.arange(n)) & 1)
