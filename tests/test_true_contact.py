@@ -218,8 +218,8 @@ CONTACTS = f"""<mujoco><option timestep=".002" integrator="implicitfast" cone="{
 <site name="mount" quat="1 -1 0 0"/><site name="zone" size=".03"/>
 <site name="far" pos="0 0 .1" size=".03"/></body>
 <body name="plate" pos="-.009 0 .0134"><joint type="slide" axis="0 0 1" damping="4"/>
-<geom name="left" size=".005" pos="-.003 0 0" mass=".05"/>
-<geom name="right" size=".005" pos=".003 0 0" mass=".05"/>
+<geom name="left" size=".005" pos="-.003 0 0" mass=".05" margin=".002"/>
+<geom name="right" size=".005" pos=".003 0 0" mass=".05" gap=".003"/>
 <geom name="clear" size=".005" pos="0 0 .1" mass="1e-6"/></body>
 </worldbody><sensor>
 <contact name="left" geom1="left" data="{EVERYTHING}"/>
@@ -290,10 +290,13 @@ def on_a_static_link(turn=-1, height=0.0134):
     pad, or with turn 1 on its nail."""
     link = f'<body name="stand"><body name="link"><site name="mount" quat="1 {turn} 0 0"/>'
     link += '<site name="around" size=".04"/></body><site name="below" size=".04"/></body>'
+    link += '<site name="world" size=".04"/>'
     beside = '<body name="beside"><site name="beside" size=".04"/></body>'
     ball = f'<body pos="-.009 0 {height}"><joint type="slide" axis="0 0 1" damping="4"/>'
     ball += '<geom size=".005" mass=".1"/>'
-    touch = "".join(f'<touch name="{name}" site="{name}"/>' for name in ("around", "below", "beside"))
+    touch = "".join(
+        f'<touch name="{name}" site="{name}"/>' for name in ("around", "below", "world", "beside")
+    )
     return (
         f'<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody>{link}{beside}{ball}</body>'
         f"</worldbody><sensor>{touch}</sensor></mujoco>"
@@ -310,15 +313,15 @@ def test_touch_at_a_static_link_feels_its_biotac(place):
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, 200)
-    for name, expected in (("around", WEIGHT), ("below", WEIGHT), ("beside", 0.0)):
+    for name, expected in (("around", WEIGHT), ("below", WEIGHT), ("world", WEIGHT), ("beside", 0.0)):
         assert data.sensor(name).data[0] == pytest.approx(expected, rel=1e-2)
 
 
 @pytest.mark.parametrize("place", first([(-1, 0.0134), (1, 0.025)]), ids=["pad", "nail"])
 def test_in_a_batch_touch_at_a_static_link_feels_its_biotac(place):
     d, _ = batch_of(on_a_static_link(*place), 200)
-    read = d.sensordata.numpy()[:, :3]  # before those of the BioTac
-    np.testing.assert_allclose(read, np.tile([WEIGHT, WEIGHT, 0.0], (2, 1)), rtol=1e-2)
+    read = d.sensordata.numpy()[:, :4]  # before those of the BioTac
+    np.testing.assert_allclose(read, np.tile([WEIGHT, WEIGHT, WEIGHT, 0.0], (2, 1)), rtol=1e-2)
 
 
 def mesh_asset(name, vert, face):

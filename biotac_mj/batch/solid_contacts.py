@@ -40,9 +40,9 @@ def amend_contacts(
     any_out: wp.array(dtype=int),
     stopped: MarkedWorlds,
 ):
-    """Removes the margins of a BioTac's rigid parts, friction of none, and contacts with convex hulls of
-    non-convex shapes. The last removed contact of each pair [pair, world] is the template of those that
-    replace it."""
+    """Removes the margins of a BioTac's rigid parts and what lies within them, friction of none, and contacts
+    with convex hulls of non-convex shapes. The last of these of each pair [pair, world] is the template of
+    those that replace it."""
     i = wp.tid()
     if i >= contact.nacon[0]:
         return
@@ -59,8 +59,11 @@ def amend_contacts(
             if contact.friction[i][0] <= _MINMU:
                 contact.dim[i] = 1
             shape = shape_of[other]
-            if shape >= 0 and (contact.type[i] & _CONSTRAINT) != 0:
-                contact.type[i] = contact.type[i] - _CONSTRAINT
+            apart = contact.dist[i] >= 0.0
+            if (contact.type[i] & _CONSTRAINT) == 0 or not (apart or shape >= 0):
+                continue
+            contact.type[i] = contact.type[i] - _CONSTRAINT
+            if not apart:
                 wanted_out[part * nshapes + shape, w] = 1
                 wp.atomic_max(source_out, part * nshapes + shape, w, i)
                 any_out[0] = 1

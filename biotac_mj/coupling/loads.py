@@ -214,7 +214,8 @@ def core_geom(model: ModelView, core: int) -> int:
 def passes(model: Any, cores: Collection[int]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Passes in which MuJoCo's functions compute its sensors of force, those with a delay left out: the
     numbers of the sensors, and the body (ngeom,) of each geom. A touch sensor feels a BioTac that is welded
-    to its site's body as a part of this body, but not what else is fixed to the world.
+    to its site's body as a part of this body: of what is fixed to the world only sites of the world do, and
+    those of its own bodies.
 
     Args:
       model: mjModel, or that of mujoco_warp. cores: ids of the BioTacs' bodies.
@@ -230,7 +231,8 @@ def passes(model: Any, cores: Collection[int]) -> list[tuple[np.ndarray, np.ndar
     site = [int(read("site_bodyid")[read("sensor_objid")[i]]) if kind[i] == _TOUCH else -1 for i in wanted]
     alike, out = {}, []
     for i, b in zip(wanted.tolist(), site):
-        welded = [c for c in cores if b not in (-1, c) and weld[c] == weld[b] and root[c] == root[b]]
+        mine = [c for c in cores if b not in (-1, c) and weld[c] == weld[b]]
+        welded = [c for c in mine if b == 0 or root[c] == root[b]]
         alike.setdefault((b if welded else -1, *welded), []).append(i)
     for (b, *welded), sensors in alike.items():
         out.append((np.array(sensors), np.where(np.isin(body, welded), b, body)))

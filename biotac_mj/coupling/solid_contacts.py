@@ -125,24 +125,27 @@ class SolidContacts(SolidPairs):
         rows, first = mine.nonzero()[0], first[mine]
         part = self.part_of[np.where(first, geom[rows, 0], geom[rows, 1])]
         shape = self.shape_of[np.where(first, geom[rows, 1], geom[rows, 0])]
-        wide = rows[contacts["includemargin"][rows] > 0.0]
-        contacts["includemargin"][wide] = 0.0
-        contacts["exclude"][wide] = contacts["dist"][wide] >= 0.0
+        wide = rows[contacts["includemargin"][rows] != 0.0]
+        contacts["includemargin"][wide] = contacts["exclude"][wide] = 0
         contacts["efc_address"][wide] = -1
         slick = rows[(contacts["friction"][rows, 0] <= mujoco.mjMINMU) & (contacts["dim"][rows] > 1)]
         contacts["dim"][slick] = 1
-        hulls = shape >= 0
-        if hulls.any():
-            self._replace(data, contacts, rows[hulls], first[hulls], part[hulls], shape[hulls])
-        return bool(len(wide) or len(slick) or hulls.any())
+        gone = (shape >= 0) | (contacts["dist"][rows] >= 0.0)
+        if gone.any():
+            self._replace(data, contacts, rows[gone], first[gone], part[gone], shape[gone])
+        return bool(len(wide) or len(slick) or gone.any())
 
     def _replace(self, data, contacts, rows, first, part, shape):
         templates = {}
         for row, forward, p, s in zip(rows.tolist(), first.tolist(), part.tolist(), shape.tolist()):
-            templates.setdefault(p * len(self.shape) + s, (contacts[row].copy(), 1.0 if forward else -1.0))
+            if s >= 0:
+                pair = p * len(self.shape) + s
+                templates.setdefault(pair, (contacts[row].copy(), 1.0 if forward else -1.0))
         kept = np.delete(contacts, rows)
         contacts[: len(kept)] = kept
         data.struct.ncon = len(kept)
+        if not templates:
+            return
         for pair, pos, normal, depth in self._found(data, list(templates)):
             contact, sign = templates[pair]
             frame = contact_frame(sign * normal).ravel()
