@@ -555,7 +555,7 @@ def test_what_only_a_task_has_is_refused_elsewhere(capsys):
 @pytest.mark.parametrize("more", [["--render", "x.gif"], ["--window"], ["--port", "8123"]])
 def test_a_task_is_played_in_one_way(more, capsys):
     assert main(["play", "follow_edge", "--policy", "random", "--episodes", "1", *more]) == 2
-    assert f"episodes and {more[0][2:]} are given" in capsys.readouterr().err
+    assert f"episodes and {more[0][2:]} exclude each other" in capsys.readouterr().err
     assert main(["play", "follow_edge", "--policy", "random", "--json", *more]) == 2
     assert "json is of scores: give episodes too" in capsys.readouterr().err
 

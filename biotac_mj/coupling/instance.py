@@ -304,7 +304,7 @@ class Instance:
     def _as_far_as_known(self, result, before):
         """Result of a solve that did not converge: the end of its load path, or the last step's model."""
         stepper = self.setup.skin.stepper
-        if result.load_factor > 0.0 and (pose := self._came_to(result.state)):  # maybe on a way from outside
+        if result.load_factor > 0.0 and (pose := self._came_to(result.state)):  # maybe on a path from outside
             return dataclasses.replace(result, pose=pose)
         if not self.parts[0][STARTED]:  # the first step
             return result
@@ -373,9 +373,9 @@ class Instance:
                     "measured, and status[4] is -1 there: press less"
                     f"{', or take the full tier' * self._tier} (docs/concepts/tiers.md)"
                 )
-            failed, way = self.state[FAILED] + (not good), result.load_factor
+            failed, load_factor = self.state[FAILED] + (not good), result.load_factor
             of_solve = result.iterations, result.residual
-            of_step = good, failed, *of_solve, tier, self.outcome.rounds, way, self.outcome.withheld
+            of_step = good, failed, *of_solve, tier, self.outcome.rounds, load_factor, self.outcome.withheld
             out[self.sensor["status"]] = of_step
 
     def _warn_once(self, text):

@@ -156,8 +156,8 @@ def _phase_prediction(y, frequency, rate):
         w = min(fits, key=lambda w: np.sum((w / noise) ** 2))
         amplitude.append(np.hypot(*w))
         mine = clipped[block == b] / noise
-        left = mine - step[block == b] @ w / noise
-        gain[b] = 0.5 * ((mine**2).sum() - (left**2).sum()) / y.shape[1]
+        residual = mine - step[block == b] @ w / noise
+        gain[b] = 0.5 * ((mine**2).sum() - (residual**2).sum()) / y.shape[1]
     return gain, np.array(amplitude)
 
 

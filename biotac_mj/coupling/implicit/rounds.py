@@ -344,8 +344,8 @@ def ask(wanted: wp.array(dtype=int), gone: wp.array(dtype=bool), r: Rounds):
 def _beyond_slack(model: Model, g: int, w: int, moved: vec6, free: real):
     """Size of a motion from the pose of the skin's model [m]; zero within `free` times `slack`, where the
     body cannot touch."""
-    way = wp.length(vec3(moved[0], moved[1], moved[2])) + real(LEVER) * wp.length(_turns(moved))
-    if way > free * model.slack[g, w]:
+    length = wp.length(vec3(moved[0], moved[1], moved[2])) + real(LEVER) * wp.length(_turns(moved))
+    if length > free * model.slack[g, w]:
         return size_of(moved)
     return real(0.0)
 

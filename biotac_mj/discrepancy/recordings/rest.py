@@ -185,7 +185,7 @@ def _together(step, log):
     stays = np.flatnonzero(many & (uniform_filter1d(many.astype(float), 5) < 0.3))
     if len(stays):
         tree = cKDTree(step[stays])
-        alike = [tree.query_ball_point(way * step[stays], 1, p=np.inf, return_length=True) for way in (1, -1)]
+        alike = [tree.query_ball_point(s * step[stays], 1, p=np.inf, return_length=True) for s in (1, -1)]
         many[stays] = sum(alike) <= 2 * _FEW
     return many
 

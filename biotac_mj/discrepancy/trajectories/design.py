@@ -72,9 +72,9 @@ class Separation:
         # of every contact: (true, other) x'x; of each other its S'x (k, true), and its S'S
         self.square, self.pull, self.gram = [], [], []
         for parts in zip(*residuals):
-            left = np.stack([residual for residual, _ in parts])
+            residual = np.stack([one for one, _ in parts])
             columns = np.stack([np.pad(own, ((0, 0), (0, most - own.shape[1]))) for _, own in parts])
-            difference = left[:, None] - left
+            difference = residual[:, None] - residual
             self.square.append((difference**2).sum(2))
             self.pull.append(np.einsum("bmk,bam->bka", columns, difference))
             self.gram.append(np.einsum("bmk,bml->bkl", columns, columns))

@@ -24,7 +24,7 @@ class Settings(TaskSettings):
         its rim [m]. turn: initial angle of the rim to the finger [rad].
       rate, reach: change of the goals of x, y, z [m] and yaw [rad] by a decision, and in total.
       on_rim: distance from the rim at which the pad is on it [m]. forces: range of the pressing force [N].
-      speed: along the rim for the full reward [m/s]. way: distance along it for a success [m].
+      speed: along the rim for the full reward [m/s]. distance: distance along it for a success [m].
       lost: distance from the rim at which the episode is lost [m].
     """
 
@@ -40,7 +40,7 @@ class Settings(TaskSettings):
     on_rim: float = 1.5e-3
     forces: tuple = (0.15, 3.0)
     speed: float = 8e-3
-    way: float = 8e-3
+    distance: float = 8e-3
     lost: float = 10e-3
 
 
@@ -53,8 +53,8 @@ class FollowEdge(BatchTask):
     changes of four joints [cm, rad], velocities, goals as fractions of `reach`, the time;
     "state" (num_envs, 4): distance outside the rim [mm], turn against it [rad], height of the pad over the
     plate [mm], force [N]. Reward of a decision, where the pad presses with a force between `forces`: 0.1, up
-    to 0.3 more near the rim, and on it up to 0.6 more for the speed along it. Success: `way` along the rim,
-    on it, by the end."""
+    to 0.3 more near the rim, and on it up to 0.6 more for the speed along it. Success: `distance` along
+    the rim, on it, by the end."""
 
     num_actions = 4
     camera = ((-0.02, 0.012, -0.01), 0.12, 125.0, -25.0)
@@ -122,7 +122,7 @@ class FollowEdge(BatchTask):
         self._along += on * travel
         speed = (travel / (s.substeps * s.timestep * s.speed)).clamp(0, 1)
         paid = pressing * (0.1 + 0.3 / (1 + (off / s.on_rim) ** 2)) + 0.6 * on * speed
-        return paid, self.held, self._along >= s.way, (s.way - self._along).clamp(min=0.0)
+        return paid, self.held, self._along >= s.distance, (s.distance - self._along).clamp(min=0.0)
 
     def _command(self):
         self._ctrl[:] = self._moved

@@ -317,8 +317,8 @@ def _misfits(m, middle, trend):
         size = m.given.along(pattern, amplitude[None])[0]
         spread = m.given.noise**2 + (_SCATTER * size * pattern) ** 2
         beyond = amplitude - size * np.r_[pattern, np.zeros(len(amplitude) - len(pattern))]
-        left = m.given.residual(beyond[None])[0] if m.dimensions else beyond
-        out[effect.id] = float(left @ (left / spread))
+        residual = m.given.residual(beyond[None])[0] if m.dimensions else beyond
+        out[effect.id] = float(residual @ (residual / spread))
     return out
 
 

@@ -117,7 +117,7 @@ class _Rest:
         self.rest = [piece != b for b in range(BLOCKS)]
         self.fits = [np.linalg.pinv(baseline[rest], rcond=1e-6) for rest in self.rest]
         self.baseline = baseline
-        self.left = [y - baseline @ (fit @ y[rest]) for fit, rest in zip(self.fits, self.rest)]
+        self.residual = [y - baseline @ (fit @ y[rest]) for fit, rest in zip(self.fits, self.rest)]
         self.square = (
             np.median(np.diff(y, axis=0) ** 2, axis=0) / chi2.median(1) + 2 * least
         )  # twice the noise's
@@ -126,11 +126,11 @@ class _Rest:
         """Nats (blocks,) that a fraction of the law (n, c), or the whole, gains in each piece left out, and
         the fraction."""
         gains, fractions = [], []
-        for fit, rest, left in zip(self.fits, self.rest, self.left):
+        for fit, rest, residual in zip(self.fits, self.rest, self.residual):
             mine = law - self.baseline @ (fit @ law[rest])
-            fraction = (mine * left / self.square)[rest].sum() / (mine**2 / self.square)[rest].sum()
+            fraction = (mine * residual / self.square)[rest].sum() / (mine**2 / self.square)[rest].sum()
             fraction = 1.0 if whole else fraction
-            before, after = ((e[~rest] ** 2).mean(0) for e in (left, left - fraction * mine))
+            before, after = ((e[~rest] ** 2).mean(0) for e in (residual, residual - fraction * mine))
             gains.append(log_ratio(before, after, (~rest).sum(), self.square / 2).mean())
             fractions.append(fraction)
         return np.array(gains), float(np.mean(fractions))

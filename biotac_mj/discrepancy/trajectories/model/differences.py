@@ -173,10 +173,10 @@ def _films(sim, trajectories, base, logs, tick):
 def _uneven(sim, places):
     """A modulus that varies along and across the finger, or in spots."""
     given, geometry = read_settings(sim.material, sim.options).modulus, load_skin(sim.skin)
-    for way in (*MAPS, *places):
-        by = _UNEVEN if way in MAPS else _SPOT
-        modulus = moduli(given, modulus_of({way: by}), geometry)
-        yield Change(way, by, sim.but(options=sim.options | {"modulus": modulus}))
+    for name in (*MAPS, *places):
+        by = _UNEVEN if name in MAPS else _SPOT
+        modulus = moduli(given, modulus_of({name: by}), geometry)
+        yield Change(name, by, sim.but(options=sim.options | {"modulus": modulus}))
 
 
 def tacky(sim: Solver, work: float) -> Change:

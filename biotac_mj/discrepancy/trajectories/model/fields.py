@@ -192,7 +192,7 @@ def _begin(order, t, base, slopes, first_tdc):
         session={},
         rest_log_z=base["log_z"][0],
         stiffness=_stiffness(base, slopes, t, order),
-        answers={way: slopes[way][order] for way in slopes if way in _ANSWERS or way.startswith(_SEVERAL)},
+        answers={one: slopes[one][order] for one in slopes if one in _ANSWERS or one.startswith(_SEVERAL)},
         pos=t.pos,
     )
 
