@@ -369,11 +369,11 @@ def stop(x: np.ndarray, limit: float | np.ndarray) -> np.ndarray:
     """(n, ...) stop operator: follows x from zero, at most to the limit in either direction."""
     out = np.zeros_like(x)
     for i in range(1, len(x)):
-        out[i] = np.clip(out[i - 1] + x[i] - x[i - 1], -limit, limit)
+        out[i] = np.minimum(np.maximum(out[i - 1] + x[i] - x[i - 1], -limit), limit)
     return out
 
 
-@functools.lru_cache(maxsize=8)  # force, pressure and electrodes of a run share it
+@functools.lru_cache(maxsize=512)  # runs of the same trajectories share it
 def _decay_matrix(time, tau):
     """(n, n - 1) fraction of the change between times j and j + 1 that remains at time i; time: (n,) [s], as
     bytes, so that it can be a cache key."""

@@ -243,20 +243,22 @@ class _Model:
             # from above: what parameters explain is taken from what is missed, and not the other way
             amplitude = likelihood.amplitude_of(point.y**2, size)
         for _ in range(_STEPS):
-            columns = self._columns(point)
+            columns = lawful = self._columns(point)
             y = point.y + np.tensordot(point.away, columns, 1)  # as from the prior's mean
             whole = np.concatenate([point.errors, columns])
             amplitude = likelihood.amplitudes(y, whole, amplitude, size)
             variance = likelihood.variance(amplitude, size)
             _, weights, factor = likelihood.evidence(y, whole, variance)
             if point.done:
-                columns = self._lawful(columns, weights[poses:], law_errors)
-                y = point.y + np.tensordot(point.away, columns, 1)
-                whole = np.concatenate([point.errors, columns])
+                lawful = self._lawful(columns, weights[poses:], law_errors)
+                y = point.y + np.tensordot(point.away, lawful, 1)
+                whole = np.concatenate([point.errors, lawful])
                 _, weights, factor = likelihood.evidence(y, whole, variance)
             known, law_errors = law_errors, likelihood.law_errors(law_errors, weights, factor, poses)
-            laws = likelihood.laws(point.done, law_errors)
-            point = dataclasses.replace(point, errors=np.concatenate([point.errors[:poses], laws]))
+            larger = np.concatenate(
+                [np.ones(poses), np.repeat(law_errors / known, len(likelihood.error_modes))]
+            )
+            point = dataclasses.replace(point, errors=point.errors * larger[:, None, None])
             step, off = weights[len(point.errors) :] - point.away, self._offsets(weights) - point.offsets
             far = max(np.abs(step).max(initial=0), np.abs(off).max() / self.comparison.repeatability)
             step, off = (by * min(1.0, _FARTHEST / max(far, 1e-9)) for by in (step, off))
@@ -269,7 +271,9 @@ class _Model:
                     break
             if gain < _DONE and np.array_equal(known, law_errors):
                 break
-        return self._finished(point, amplitude, law_errors)
+        else:
+            columns = self._columns(point)
+        return self._finished(point, columns, amplitude, law_errors)
 
     def _lawful(self, columns, weights, law_errors):
         """Columns of parameters beside what the laws of their effects lack by these weights: where an effect
@@ -301,9 +305,9 @@ class _Model:
         acts = [act / max(np.linalg.norm(act), 1e-30) for act in acts]
         return float(sum(act @ acts[-1] for act in acts[:-1]))
 
-    def _finished(self, point, amplitude, law_errors):
+    def _finished(self, point, columns, amplitude, law_errors):
         likelihood, size = self.likelihood, self.likelihood.size
-        columns, expected = self._columns(point), size
+        expected = size
         for change, error in zip(point.done, law_errors):
             expected = np.hypot(expected, error * np.quantile(np.abs(change), 0.98, axis=0))
         whole, errors = np.concatenate([point.errors, columns]), len(point.errors)

@@ -118,8 +118,8 @@ class Likelihood:
         )
 
     def turned(self, values: np.ndarray) -> np.ndarray:
-        """(..., n, width) in the kernel's eigenvectors."""
-        return self._vectors.T @ values
+        """(..., n, width) in the kernel's eigenvectors, all by one product."""
+        return np.moveaxis(np.tensordot(self._vectors, values, (0, -2)), 0, -2)
 
     def times(self, process: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Values (n, width) in the eigenvectors times a process (n,) over rows."""
@@ -128,12 +128,8 @@ class Likelihood:
     def laws(self, changes: list[np.ndarray], errors: np.ndarray) -> np.ndarray:
         """(m, n, width) what errors of laws do, of one standard deviation each, in the eigenvectors; changes:
         (n, width) what each effect does, errors (effects,): of its law."""
-        out = [
-            self.turned(error * change * mode[:, None])
-            for change, error in zip(changes, errors)
-            for mode in self.error_modes
-        ]
-        return np.array(out).reshape(len(out), len(self.error_modes[0]), len(self.size))
+        out = [e * change * mode[:, None] for change, e in zip(changes, errors) for mode in self.error_modes]
+        return self.turned(np.reshape(out, (-1, len(self.error_modes[0]), len(self.size))))
 
     def law_errors(
         self, errors: np.ndarray, weights: np.ndarray, factor: np.ndarray, begin: int
@@ -156,12 +152,11 @@ class Likelihood:
     ) -> tuple[float, np.ndarray, np.ndarray]:
         """log density of y (n, width), in the eigenvectors, with coefficients of unit variance on columns
         (m, n, width); their most probable values (m,) and the Cholesky factor of their precision."""
-        flat = columns.reshape(len(columns), -1)
-        weighted = flat / variance.ravel()
-        factor = np.linalg.cholesky(np.eye(len(flat)) + weighted @ flat.T)
-        pull = np.linalg.solve(factor, weighted @ y.ravel())
-        square = (y**2 / variance).sum() - pull @ pull
-        log = -0.5 * square - np.log(np.diag(factor)).sum() - 0.5 * np.log(variance).sum()
+        white = 1 / np.sqrt(variance)
+        flat, y = (columns * white).reshape(len(columns), -1), (y * white).ravel()
+        factor = np.linalg.cholesky(np.eye(len(flat)) + flat @ flat.T)
+        pull = np.linalg.solve(factor, flat @ y)
+        log = -0.5 * (y @ y - pull @ pull) - np.log(np.diag(factor)).sum() + np.log(white).sum()
         return float(log), np.linalg.solve(factor.T, pull), factor
 
     def prior(self, amplitude: np.ndarray, law_errors: np.ndarray) -> float:
@@ -181,8 +176,8 @@ class Likelihood:
         amplitude = begin
         for _ in range(rounds):
             _, weights, factor = self.evidence(y, columns, self.variance(amplitude, size))
-            spread = np.linalg.solve(factor, columns.reshape(len(columns), -1)).reshape(columns.shape)
-            square = (y - np.tensordot(weights, columns, 1)) ** 2 + (spread**2).sum(0)
+            spread = np.linalg.inv(factor) @ columns.reshape(len(columns), -1)
+            square = (y - np.tensordot(weights, columns, 1)) ** 2 + (spread**2).sum(0).reshape(y.shape)
             new = self.amplitude_of(square, size)
             if np.array_equal(new, amplitude):
                 break
@@ -241,11 +236,12 @@ class TrajectoryLikelihood(Likelihood):
         deviation: three for each trajectory, about its offset in `offsets` (trajectories, 3) [m]. Their mean
         is left out: an offset of all trajectories is a finding, not an error."""
         out, edges = [], np.concatenate([[0], np.cumsum([len(r) for r in self._rows])])
+        total = self._vectors.sum(0)
         for k, (i, rows) in enumerate(zip(self.chosen, self._rows)):
             own = self._vectors[edges[k] : edges[k + 1]].T  # of all other rows the rest alone moves
             for column in self.comparison.moved(i, offsets[i]):
                 rest = self._resting * column[0] / len(self.chosen)
-                out.append(own @ column[rows] - np.outer(self._vectors.sum(0), rest))
+                out.append(own @ column[rows] - np.outer(total, rest))
         return self.comparison.repeatability * np.array(out)
 
 
