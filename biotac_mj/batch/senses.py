@@ -19,6 +19,7 @@ from ..sensor.materials import Material
 from ..sensor.presets import Sensor
 from ..sensor.vibration import Modes, Texture, Vibration
 from ..skin.modes import skin_modes
+from ..skin.newton.worlds import CONVERGED, Worlds
 from ..skin.touched import Touched
 from .skin import BatchSkin
 
@@ -116,19 +117,26 @@ def find_changed(
     # In:
     due: wp.array(dtype=int),
     awake: wp.array(dtype=int),
+    st: Worlds,
+    given_pressure: int,
+    state: wp.array2d(dtype=wp.float64),
     # In and out:
     known: wp.array(dtype=int),
+    pressure: wp.array(dtype=wp.float64),
     # Out:
     changed_out: wp.array(dtype=int),
     any_out: wp.array(dtype=int),
 ):
     """Finds due worlds whose film has changed since its last solution; `known` where it was solved since the
-    skin moved."""
+    skin moved. Film and pressure hold where the skin did not get to its bodies: as
+    `coupling.instance.Instance` does."""
     w = wp.tid()
     if awake[w] == 1:
         known[w] = 0
     changed_out[w] = 0
-    if due[w] == 1 and known[w] == 0:
+    if st.reason[w] != CONVERGED and st.load_factor[w] < wp.float64(1.0):
+        pressure[w] = state[w, given_pressure]
+    elif due[w] == 1 and known[w] == 0:
         known[w] = 1
         changed_out[w] = 1
         any_out[0] = 1
@@ -265,8 +273,9 @@ class Senses:
         if self.heat:
             self.heat.advance(self._dt)
         due = self.acquisition.find_due(self._dt)
-        inputs = [due, awake]
-        outputs = [self._known, self._changed, any]
+        worlds, a = self._skin.data.worlds, self.acquisition
+        inputs = [due, awake, worlds, a.place.given_pressure, a.state]
+        outputs = [self._known, self._skin.pressure, self._changed, any]
         wp.launch(find_changed, self._skin.nworld, inputs, outputs, device=due.device)
 
     def solve_film(self) -> None:

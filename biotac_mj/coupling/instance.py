@@ -302,8 +302,11 @@ class Instance:
         return ends and self.touching.body_pose(*ends)
 
     def _as_far_as_known(self, result, before):
-        """Result of a solve that did not converge: the end of its load path, or the last step's model."""
+        """Result of a solve that did not converge: the end of its load path, or the last step's model. Short
+        of where the bodies are nothing is known of the skin there: the readings hold."""
         stepper = self.setup.skin.stepper
+        if result.load_factor < 1.0:
+            result = dataclasses.replace(result, vert_xpos=None, pressure=None)
         if result.load_factor > 0.0 and (pose := self._came_to(result.state)):  # maybe on a path from outside
             return dataclasses.replace(result, pose=pose)
         if not self.parts[0][STARTED]:  # the first step
@@ -314,15 +317,9 @@ class Instance:
             stepper.reset(state)
             if not stepper.resting(state):  # it has more to lose
                 state[:] = before
-        return dataclasses.replace(
-            result,
-            state=state,
-            load=np.ones(len(stepper.contact_rows(state))),  # not known: even
-            wrench=wrench,
-            tangent=tangent,
-            pose=tuple(last),
-            vert_xpos=stepper.vert_xpos(state),
-        )
+        load = np.ones(len(stepper.contact_rows(state)))  # not known: even
+        model = {"wrench": wrench, "tangent": tangent, "pose": tuple(last)}
+        return dataclasses.replace(result, state=state, load=load, **model)
 
     def _counts(self):
         if self._reading is None:

@@ -49,8 +49,7 @@ class SkinResult:
         [N, N m].
       tangent: (ngroup, 6, 6) -d wrench / d (translation, rotation vector about the origin), symmetric
         positive semi-definite.
-      vert_xpos: (nvert, 3) deformed nodes [m].
-      pressure: of the liquid [Pa].
+      vert_xpos: (nvert, 3) deformed nodes [m]. pressure: of the liquid [Pa]. None: not known.
       converged, iterations, residual: how the solve went.
       load_factor: fraction of the touching bodies' motion in this step at which all this holds: 1 where it
         converged, or was cut off at an iterate that goes all the way; of their way into the skin, where they
@@ -65,8 +64,8 @@ class SkinResult:
     state: np.ndarray | None
     wrench: np.ndarray
     tangent: np.ndarray
-    vert_xpos: np.ndarray
-    pressure: float = 0.0
+    vert_xpos: np.ndarray | None
+    pressure: float | None = 0.0
     converged: bool = True
     iterations: int = 0
     residual: float = 0.0
@@ -204,9 +203,15 @@ class Readings(Protocol):
         """Writes the state at time zero into state (nstate,)."""
 
     def advance(
-        self, state: np.ndarray, time: float, dt: float, vert_xpos: np.ndarray, pressure: float
+        self,
+        state: np.ndarray,
+        time: float,
+        dt: float,
+        vert_xpos: np.ndarray | None,
+        pressure: float | None,
     ) -> dict:
-        """Advances state in place over [time, time + dt] and returns channel -> counts."""
+        """Advances state in place over [time, time + dt] and returns channel -> counts. What is None is not
+        known: its channels hold."""
 
     # Readings may have the methods below. With the first `advance` also gets area [m^2] and force [N],
     # (ngroup,) each, of what touches at the end of the step; with the others what `shaking` returns.

@@ -140,7 +140,7 @@ class Acquisition:
         time: float,
         dt: float,
         impedance: ArrayLike | None = None,
-        pressure: float = 0.0,
+        pressure: float | None = 0.0,
         temperature: float | None = None,
         shaken: wp.array | None = None,
         liquid: float = 0.0,
@@ -151,8 +151,8 @@ class Acquisition:
           state: (nstate,) float64, updated in place.
           time: at the start of the step [s]; dt: its length [s].
           impedance: (n,) at the end of the step [ohm]; None holds the last one (see `needs_impedance`).
-          pressure: at the end of the step, above rest [Pa].
-          temperature: of the core at the end of the step [C]; None keeps the last one.
+          pressure: at the end of the step, above rest [Pa]; temperature: of the core then [C]; None keeps
+            the last one.
           shaken: (1, n) float64 on the CPU, further band-passed pressure on PAC at each of the slots [Pa]
             (`vibration`).
           liquid: temperature at the end of the step above that of the impedances [C].
@@ -166,6 +166,7 @@ class Acquisition:
             raise ValueError(f"time is {time} and dt is {dt}: pass finite seconds, dt positive")
         if impedance is not None:
             impedance = self._check_impedance(impedance)
+        pressure = state[self.place.given_pressure] if pressure is None else pressure
         temperature = state[self.place.given_temperature] if temperature is None else temperature
         signals = self._check_scalars(pressure, temperature)
         _one(self.design).sample(self.seed, self.noise, state, time, dt, impedance, *signals, liquid, shaken)

@@ -131,7 +131,7 @@ class PhysicsReadings:
         time: float,
         dt: float,
         vert_xpos: np.ndarray | None,
-        pressure: float,
+        pressure: float | None,
         area: np.ndarray | None = None,
         force: np.ndarray | None = None,
         shaking: tuple | None = None,
@@ -142,8 +142,8 @@ class PhysicsReadings:
         Args:
           state: (nstate,) float64, updated in place.
           time: at the start of the step [s]; dt: its length [s].
-          vert_xpos: (nvert, 3), nodes at the end of the step, BioTac frame [m].
-          pressure: of the liquid at the end of the step, above rest [Pa].
+          vert_xpos: (nvert, 3), nodes at the end of the step, BioTac frame [m]; None holds the impedance.
+          pressure: of the liquid at the end of the step, above rest [Pa]; None holds the last one.
           area, force: (nbody,) contact area [m^2] and force [N] of each body, for heat; None: no contact.
           shaking: `drive`, `gain`, `slip` and `area` of `Vibration`; None: nothing moves the skin.
           impedance: (n,) of the film at the end of the step [ohm]; the film is not solved then.
@@ -155,7 +155,8 @@ class PhysicsReadings:
         heat = self._advance_heat(state, dt, area, force)
         if heat is not None:
             temperature, liquid = heat[THERMISTOR], heat[ABOVE]
-        if impedance is None and self.acquisition.needs_impedance(counts, time, dt):
+        seen = impedance is None and vert_xpos is not None
+        if seen and self.acquisition.needs_impedance(counts, time, dt):
             with contextlib.suppress(
                 NoFilmError
             ):  # the film of a skin after a hard hit: electrodes hold, as in batches
