@@ -126,6 +126,26 @@ def read(mjm, d, channel):
 
 
 @pytest.mark.parametrize("tier", ["condensed", "full"])
+def test_readings_hold_in_the_world_that_did_not_get_there(tier):
+    """They are those of the last step in which its skin reached the ball, as with `mj_step`."""
+    mjm, m, d, _ = make(press_spec(), 2, tier=tier, readings={"noise": False})
+    start = places(2)
+    deep = np.ones(2)
+    for step in range(16):
+        if step == 10:
+            before, deep = readings_of(mjm, d), np.array([1, 8])
+        for _ in press(m, d, start, 1, 1e-3 * deep):
+            pass
+    status = read(mjm, d, "status")
+    assert status[:, 1].tolist() == [0, 6] and np.ptp(before, axis=0).max() > 20
+    np.testing.assert_array_equal(readings_of(mjm, d)[1], before[1])
+
+
+def readings_of(mjm, d):
+    return np.concatenate([read(mjm, d, name) for name in ("electrodes", "pdc")], axis=1).copy()
+
+
+@pytest.mark.parametrize("tier", ["condensed", "full"])
 def test_skins_that_are_put_back_remember_the_step_before(tier):
     """Of worlds that touch, begin to touch, and leave in the step."""
     _, m, d, batch = make(press_spec(), 3, tier=tier, readings=False)

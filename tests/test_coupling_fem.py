@@ -449,6 +449,37 @@ def test_an_unconverged_step_goes_on_from_its_iterate(back):
     np.testing.assert_allclose(handle.read(data, "contact_force"), force, rtol=0.01, atol=1e-5)
 
 
+@pytest.mark.parametrize("tier", ["full", "condensed"])
+def test_readings_hold_where_the_skin_did_not_get(tier):
+    """To a ball in the core, on whichever way solves come, and anew from rest; force and counter go on."""
+    model, data, handle = pressing(
+        f'<geom type="sphere" size="{RADIUS}"/>',
+        readings="biotac",
+        options={"readings": {"noise": False}},
+        tier=tier,
+        **COARSE,
+    )
+
+    def read():
+        return np.concatenate([handle.read(data, name) for name in ("electrodes", "pdc")])
+
+    mujoco.mj_step(model, data)
+    rest = read()
+    data.mocap_pos[0, 2] = TOP + RADIUS - 5e-4
+    mujoco.mj_step(model, data, 10)
+    settled = read()
+    data.mocap_pos[0, 2] -= 4e-3
+    for step in range(1, 7):
+        mujoco.mj_step(model, data)
+        assert handle.read(data, "status")[:2].tolist() == [0, step]
+        np.testing.assert_array_equal(read(), settled)
+    assert handle.read(data, "contact_force")[1] > 1
+    data.mocap_pos[0, 2] += 2e-2
+    mujoco.mj_step(model, data, 10)
+    assert handle.read(data, "status")[0] == 1
+    np.testing.assert_allclose(read(), rest, atol=1)
+
+
 def test_a_press_that_asked_for_too_much_work_goes_on():
     """From its iterate, where a body is held whatever the skin does: it would be as hard, in vain and for
     ever."""
