@@ -168,11 +168,8 @@ def device(text: str) -> str:
 
 def add_ray(parser: argparse.ArgumentParser) -> None:
     """Adds --ray."""
-    parser.add_argument(
-        "--ray",
-        metavar="ADDRESS",
-        help="address of a Ray cluster that shares the work (docs/howto/cluster.md); local: processes here",
-    )
+    text = "address of a Ray cluster that shares the work (docs/howto/cluster.md); local: processes here"
+    parser.add_argument("--ray", metavar="ADDRESS", help=text)
 
 
 def check_device(names: str) -> None:

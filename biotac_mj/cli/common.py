@@ -42,18 +42,13 @@ def _imported(place):
 
 def add_skin(verb: argparse.ArgumentParser, seed: str = "of the sensor's noise") -> None:
     """Adds the skin, its rubber, tier, device and the seed; seed: its purpose."""
-    verb.add_argument(
-        "--skin",
-        default="default",
-        help=f"mesh of the skin: {', '.join(SKINS)}, of a BioTac SP biotac_sp/coarse and so on, a folder of "
-        "`biotac design new`, or a file made by `biotac lab mesh`",
+    text = (
+        f"mesh of the skin: {', '.join(SKINS)}, of a BioTac SP biotac_sp/coarse and so on, a folder of "
+        "`biotac design new`, or a file made by `biotac lab mesh`"
     )
-    verb.add_argument(
-        "--tier",
-        default="full",
-        choices=TIERS,
-        help="full finite elements, or the condensed skin, fast and less exact, for hands and control",
-    )
+    verb.add_argument("--skin", default="default", help=text)
+    text = "full finite elements, or the condensed skin, fast and less exact, for hands and control"
+    verb.add_argument("--tier", default="full", choices=TIERS, help=text)
     verb.add_argument(
         "--material", default="default", help=f"{', '.join(MATERIALS)}, a .json file of a material, or JSON"
     )
@@ -77,44 +72,29 @@ def add_device(verb: argparse.ArgumentParser) -> None:
 
 def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
     """Adds the sensor, and the material of `touched`."""
-    verb.add_argument(
-        "--sensor",
-        type=choice,
-        metavar="NAME",
-        help="which sensor (default: 1): 1, 2, 3, epfl_f1, epfl_f2, phac_f0, phac_f1, btd_sp, random, JSON, "
-        "or a file of it",
+    text = (
+        "which sensor (default: 1): 1, 2, 3, epfl_f1, epfl_f2, phac_f0, phac_f1, btd_sp, random, JSON, "
+        "or a file of it"
     )
-    verb.add_argument(
-        "--signal",
-        default="physics",
-        metavar="NAME",
-        help="source of the electrodes: physics (the film), latent_projection or learned (networks, "
-        "extra learning), or a file *.safetensors of `biotac learn train`",
+    verb.add_argument("--sensor", type=choice, metavar="NAME", help=text)
+    text = (
+        "source of the electrodes: physics (the film), latent_projection or learned (networks, "
+        "extra learning), or a file *.safetensors of `biotac learn train`"
     )
-    verb.add_argument(
-        "--randomise",
-        nargs="+",
-        metavar="EFFECT",
-        help="random effects: gain dead crosstalk pdc_gain relax warmup fluidloss drift",
-    )
-    verb.add_argument(
-        "--effects",
-        metavar="FILE.yaml",
-        help="sensor file of `biotac diagnose`, with base model and effects (sensor_amended.yaml)",
-    )
+    verb.add_argument("--signal", default="physics", metavar="NAME", help=text)
+    text = "random effects: gain dead crosstalk pdc_gain relax warmup fluidloss drift"
+    verb.add_argument("--randomise", nargs="+", metavar="EFFECT", help=text)
+    text = "sensor file of `biotac diagnose`, with base model and effects (sensor_amended.yaml)"
+    verb.add_argument("--effects", metavar="FILE.yaml", help=text)
     for names, what, example in (
         (["--thermal"], "for heat: what {} made of", "steel"),
         (["--texture", "--textures"], "for texture: what {} made of", "cork"),
     ):
-        verb.add_argument(
-            *names,
-            action=_Drawn,
-            nargs="+",
-            type=choice,
-            metavar="MATERIAL",
-            help=f"{what.format(touched)}, such as {example}, or JSON; of several one is drawn at random "
-            "(default: none)",
+        text = (
+            f"{what.format(touched)}, such as {example}, or JSON; of several one is drawn at random "
+            "(default: none)"
         )
+        verb.add_argument(*names, action=_Drawn, nargs="+", type=choice, metavar="MATERIAL", help=text)
 
 
 def add_results(verb: argparse.ArgumentParser, folder: str, text: str, *names: str) -> None:
@@ -155,9 +135,8 @@ class _Drawn(argparse.Action):
 
 def add_options(verb: argparse.ArgumentParser) -> None:
     """Adds further settings as JSON."""
-    verb.add_argument(
-        "--options",
-        metavar="JSON",
-        help="further settings of the skin, JSON or a file of it: "
-        '{"skin": {"contact_law": {"adhesion": 0.05}}, "modulus": "factors.npy"} (docs/features.md)',
+    text = (
+        "further settings of the skin, JSON or a file of it: "
+        '{"skin": {"contact_law": {"adhesion": 0.05}}, "modulus": "factors.npy"} (docs/features.md)'
     )
+    verb.add_argument("--options", metavar="JSON", help=text)

@@ -18,99 +18,61 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
         _diagnose,
         "Find effects in measured data that the simulation lacks; writes report.html and verdict.json.",
     )
-    verb.add_argument(
-        "data",
-        nargs="?",
-        metavar="DATA",
-        help="HDF5 of measured trajectories, or a recording, with the object's poses or without "
-        "(docs/lab/discrepancy.md)",
+    text = (
+        "HDF5 of measured trajectories, or a recording, with the object's poses or without "
+        "(docs/lab/discrepancy.md)"
     )
+    verb.add_argument("data", nargs="?", metavar="DATA", help=text)
     verb.add_argument(
         "--object", metavar="NAME", help="object in DATA, if the file does not name it, such as sphere_7mm"
     )
-    verb.add_argument(
-        "--repeatability",
-        type=quantity("length", 5e-3, 1e-7),
-        metavar="LENGTH",
-        help="scatter of poses between trials (default: 0.05mm)",
-    )
-    verb.add_argument(
-        "--earlier",
-        nargs="+",
-        metavar="REPORT",
-        help="folders of earlier reports, whose trajectories are added to DATA",
-    )
+    text = "scatter of poses between trials (default: 0.05mm)"
+    verb.add_argument("--repeatability", type=quantity("length", 5e-3, 1e-7), metavar="LENGTH", help=text)
+    text = "folders of earlier reports, whose trajectories are added to DATA"
+    verb.add_argument("--earlier", nargs="+", metavar="REPORT", help=text)
     verb.add_argument("--skin", help="mesh that simulates DATA (default: that of --effects, or coarse)")
-    verb.add_argument(
-        "--effects",
-        metavar="FILE.yaml",
-        help="simulator to compare with DATA: a sensor_amended.yaml (default: our own sensor)",
+    text = "simulator to compare with DATA: a sensor_amended.yaml (default: our own sensor)"
+    verb.add_argument("--effects", metavar="FILE.yaml", help=text)
+    text = (
+        "plain recording instead: text, a column of raw counts for each electrode, one row per sample; "
+        "or any file of `biotac recording import`; or several, each a series of one sensor"
     )
-    verb.add_argument(
-        "--electrodes",
-        nargs="+",
-        metavar="FILE",
-        help="plain recording instead: text, a column of raw counts for each electrode, one row per sample; "
-        "or any file of `biotac recording import`; or several, each a series of one sensor",
-    )
+    verb.add_argument("--electrodes", nargs="+", metavar="FILE", help=text)
     add_which(verb)
     verb.add_argument("--force", metavar="FILE", help="with --electrodes: Fx Fy Fz [N] row by row")
     verb.add_argument(
         "--tdc", metavar="FILE", help="with --electrodes: raw counts of the thermistor row by row"
     )
-    verb.add_argument(
-        "--protocol",
-        metavar="FILE.yaml",
-        help="plain recording of a checkup: when each step was done, as `biotac recording record --protocol` "
-        "wrote it",
+    text = (
+        "plain recording of a checkup: when each step was done, as `biotac recording record --protocol` "
+        "wrote it"
     )
-    verb.add_argument(
-        "--rate",
-        type=real(1e-3, 1e6),
-        default=None,
-        metavar="HZ",
-        help="rows per second (default: guessed from repeated rows, else 100)",
+    verb.add_argument("--protocol", metavar="FILE.yaml", help=text)
+    text = "rows per second (default: guessed from repeated rows, else 100)"
+    verb.add_argument("--rate", type=real(1e-3, 1e6), default=None, metavar="HZ", help=text)
+    text = (
+        "flat presses with --force: fit each row's pose in simulated states (computed once, in "
+        "minutes) and report the stage of the model that disagrees"
     )
-    verb.add_argument(
-        "--simulate",
-        action="store_true",
-        help="flat presses with --force: fit each row's pose in simulated states (computed once, in "
-        "minutes) and report the stage of the model that disagrees",
-    )
-    verb.add_argument(
-        "--also",
-        nargs=2,
-        action="append",
-        metavar=("E", "F"),
-        help="electrodes and force of another sensor, with --simulate: common errors are the base model's",
-    )
+    verb.add_argument("--simulate", action="store_true", help=text)
+    text = "electrodes and force of another sensor, with --simulate: common errors are the base model's"
+    verb.add_argument("--also", nargs=2, action="append", metavar=("E", "F"), help=text)
     kept = (
         "fraction of the data held out for the test (default: "
         "0.4 of the rows, 0.3 with --force, a quarter of the trajectories)"
     )
     verb.add_argument("--locked", type=real(0.05, 0.9), default=None, metavar="FRACTION", help=kept)
-    verb.add_argument(
-        "--tier",
-        default="full",
-        choices=TIERS,
-        help="skin that simulates DATA; condensed is faster, but its own error may look like an effect",
-    )
+    text = "skin that simulates DATA; condensed is faster, but its own error may look like an effect"
+    verb.add_argument("--tier", default="full", choices=TIERS, help=text)
     verb.add_argument(
         "--material",
         help="material of the skin that simulates DATA: a preset, a .json file of a material, or JSON",
     )
     add_options(verb)
-    verb.add_argument(
-        "--in-skin",
-        action="store_true",
-        help="constitutive effects inside the finite elements (full tier) in the proof",
-    )
-    verb.add_argument(
-        "--device",
-        type=device,
-        default="cpu",
-        help="device of the full tier: cpu, or a CUDA device such as cuda:0",
-    )
+    text = "constitutive effects inside the finite elements (full tier) in the proof"
+    verb.add_argument("--in-skin", action="store_true", help=text)
+    text = "device of the full tier: cpu, or a CUDA device such as cuda:0"
+    verb.add_argument("--device", type=device, default="cpu", help=text)
     files = "report.html", "verdict.json", "sensor_amended.yaml"
     add_results(verb, "out/diagnose", "folder of the report", *files)
 
@@ -129,12 +91,9 @@ def add_next(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--budget", type=whole(1, 500), default=20, metavar="N", help="contacts, at most")
     verb.add_argument("--force", type=real(0.05, 50), default=3.0, metavar="N", help="largest force")
     verb.add_argument("--depth", type=quantity("length", 2.5e-3, 1e-4), default="1.5mm", help="largest depth")
+    text = "along the finger, tip at -x (default: -14mm -4mm)"
     verb.add_argument(
-        "--reach",
-        nargs=2,
-        type=quantity("length", 5e-3, -25e-3),
-        metavar=("FROM", "TO"),
-        help="along the finger, tip at -x (default: -14mm -4mm)",
+        "--reach", nargs=2, type=quantity("length", 5e-3, -25e-3), metavar=("FROM", "TO"), help=text
     )
     quarter = quantity("angle", math.pi / 2, 0.0)
     verb.add_argument("--around", type=quarter, default="30deg", help="largest angle around the finger")

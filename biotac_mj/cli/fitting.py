@@ -16,17 +16,10 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
         "calibration.verbs.calibrate_verb",
         "Fit E, nu, mu (and other parameters) to the forces of one indentation with shear.",
     )
-    verb.add_argument(
-        "data",
-        nargs="?",
-        metavar="DATA",
-        help="CSV of the indentation (docs/lab/calibration.md), or skin.h5 of a press",
-    )
-    verb.add_argument(
-        "--synthetic",
-        action="store_true",
-        help="instead of DATA: our own skin of --truth pressed and slid, with --noise",
-    )
+    text = "CSV of the indentation (docs/lab/calibration.md), or skin.h5 of a press"
+    verb.add_argument("data", nargs="?", metavar="DATA", help=text)
+    text = "instead of DATA: our own skin of --truth pressed and slid, with --noise"
+    verb.add_argument("--synthetic", action="store_true", help=text)
     verb.add_argument(
         "--truth", help="material of the synthetic skin; a preset, including its liquid (default: rubber)"
     )
@@ -37,54 +30,30 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
     )
     said = "liquid under the synthetic skin (default: as the preset --truth has it)"
     add_liquid(verb, None, said, "truth-")
-    verb.add_argument(
-        "--noise",
-        type=real(0, 1e3),
-        metavar="N",
-        help="noise of each synthetic force component, standard deviation (default: 0.01)",
-    )
+    text = "noise of each synthetic force component, standard deviation (default: 0.01)"
+    verb.add_argument("--noise", type=real(0, 1e3), metavar="N", help=text)
     verb.add_argument("--seed", type=SEED, default=0, help="seed of that noise")
     verb.add_argument(
         "--indenter", default=None, metavar="NAME", help=f"indenter, required for CSV: {INDENTER_HELP}"
     )
-    verb.add_argument(
-        "--direction",
-        type=real(-1e9, 1e9),
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="the indenter's tip points there (default: +y)",
-    )
+    text = "the indenter's tip points there (default: +y)"
+    verb.add_argument("--direction", type=real(-1e9, 1e9), nargs=3, metavar=("X", "Y", "Z"), help=text)
     verb.add_argument(
         "--configuration", default="shell_with_core", choices=CONFIGURATIONS, help="what is fitted"
     )
     verb.add_argument(
         "--skin", default="coarse", help=f"its mesh: {', '.join(SKINS)}, or a file; solids come as coarse"
     )
-    verb.add_argument(
-        "--correct",
-        action="store_true",
-        help="correct the fit by a refined mesh, to remove the discretisation error",
-    )
-    verb.add_argument(
-        "--material",
-        default="paper",
-        help=f"law and starting values: {', '.join(MATERIALS)}, or a material's or calibration's .json",
-    )
+    text = "correct the fit by a refined mesh, to remove the discretisation error"
+    verb.add_argument("--correct", action="store_true", help=text)
+    text = f"law and starting values: {', '.join(MATERIALS)}, or a material's or calibration's .json"
+    verb.add_argument("--material", default="paper", help=text)
     add_options(verb)
     add_liquid(verb, False, "liquid under the skin; matters for E and nu")
-    verb.add_argument(
-        "--fit",
-        nargs="+",
-        default=["E", "nu", "mu"],
-        metavar="NAME[:LOW:HIGH]",
-        help="parameters, optionally with bounds",
-    )
-    verb.add_argument(
-        "--starts",
-        type=whole(1, 100),
-        default=1,
-        help="number of starting points, used if they may improve the fit: forces may jump in the parameters",
-    )
+    text = "parameters, optionally with bounds"
+    verb.add_argument("--fit", nargs="+", default=["E", "nu", "mu"], metavar="NAME[:LOW:HIGH]", help=text)
+    text = "number of starting points, used if they may improve the fit: forces may jump in the parameters"
+    verb.add_argument("--starts", type=whole(1, 100), default=1, help=text)
     add_device(verb)
     files = "calibration.json", "calibration.png"
     verb.set_defaults(forces_of=_forces_of)
@@ -115,19 +84,11 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
         metavar="NAME",
         help="configurations to compare",
     )
+    text = "measured indentations instead of our reference; the first one is for calibration"
+    verb.add_argument("--data", nargs="+", metavar="INDENTER=FILE", help=text)
+    text = "indenters of the reference"
     verb.add_argument(
-        "--data",
-        nargs="+",
-        metavar="INDENTER=FILE",
-        help="measured indentations instead of our reference; the first one is for calibration",
-    )
-    verb.add_argument(
-        "--indenters",
-        nargs="+",
-        default=INDENTERS,
-        choices=INDENTERS,
-        metavar="NAME",
-        help="indenters of the reference",
+        "--indenters", nargs="+", default=INDENTERS, choices=INDENTERS, metavar="NAME", help=text
     )
     verb.add_argument(
         "--count", type=whole(1, 10_000), default=1, help="random indentations for each indenter"
@@ -175,18 +136,14 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--row", type=int, nargs="+", help="rows to estimate (default: the one that differs most from rest)"
     )
-    verb.add_argument(
-        "--known",
-        metavar="FILE",
-        help="a recording of the same sensor with force and contact_pos [m] in the BioTac frame, on the "
-        "undeformed skin, --rest rows first: its touches calibrate this sensor",
+    text = (
+        "a recording of the same sensor with force and contact_pos [m] in the BioTac frame, on the "
+        "undeformed skin, --rest rows first: its touches calibrate this sensor"
     )
+    verb.add_argument("--known", metavar="FILE", help=text)
     verb.add_argument("--touches", type=whole(1, 1000), default=10, help="number of these touches")
-    verb.add_argument(
-        "--indenter",
-        metavar="NAME",
-        help=f"indenter (default: that of a simulated press, else sphere_7mm): {INDENTER_HELP}",
-    )
+    text = f"indenter (default: that of a simulated press, else sphere_7mm): {INDENTER_HELP}"
+    verb.add_argument("--indenter", metavar="NAME", help=text)
     verb.add_argument(
         "--skin",
         help=f"mesh: {', '.join(SKINS)}, or a file (default: that of a simulated press, else coarse, of the "

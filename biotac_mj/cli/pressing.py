@@ -21,12 +21,8 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
         "Press an indenter into the BioTac; writes readings.csv, skin.h5 and press.png.",
     )
     verb.add_argument("--indenter", default="sphere_7mm", metavar="NAME", help=INDENTER_HELP)
-    verb.add_argument(
-        "--location",
-        nargs="+",
-        metavar=("X", "ANGLE | Y Z"),
-        help=f"{LOCATION_HELP} (default: -12mm on a BioTac, else the middle of the pad)",
-    )
+    text = f"{LOCATION_HELP} (default: -12mm on a BioTac, else the middle of the pad)"
+    verb.add_argument("--location", nargs="+", metavar=("X", "ANGLE | Y Z"), help=text)
     for name, default, text in (
         ("direction", None, "of the press (default: inward normal of the skin there)"),
         ("slide-direction", [1.0, 0.0, 0.0], "of the slide"),
@@ -45,36 +41,17 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
     ):
         verb.add_argument(f"--{name}", type=kind, default=default, metavar=metavar, help=text)
     coupling = verb.add_mutually_exclusive_group()
-    coupling.add_argument(
-        "--one-way",
-        dest="two_way",
-        action="store_false",
-        default=False,
-        help="the indenter's path is prescribed (default)",
-    )
-    coupling.add_argument(
-        "--two-way",
-        dest="two_way",
-        action="store_true",
-        default=False,
-        help="a compliant servo with mass pushes the indenter",
-    )
-    verb.add_argument(
-        "--friction",
-        type=real(0, 100),
-        metavar="MU",
-        help="between skin and indenter (default: the material's)",
-    )
+    text = "the indenter's path is prescribed (default)"
+    coupling.add_argument("--one-way", dest="two_way", action="store_false", default=False, help=text)
+    text = "a compliant servo with mass pushes the indenter"
+    coupling.add_argument("--two-way", dest="two_way", action="store_true", default=False, help=text)
+    text = "between skin and indenter (default: the material's)"
+    verb.add_argument("--friction", type=real(0, 100), metavar="MU", help=text)
     add_skin(verb)
     add_sensor(verb, "the indenter is")
     add_results(verb, "out/press", "folder of the results", "readings.csv", "skin.h5", "press.png")
-    verb.add_argument(
-        "--render",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="MuJoCo's render in press.png; "
-        "without it, or without a GL library, matplotlib draws the surfaces",
-    )
+    text = "MuJoCo's render in press.png; without it, or without a GL library, matplotlib draws the surfaces"
+    verb.add_argument("--render", action=argparse.BooleanOptionalAction, default=True, help=text)
 
 
 def _press(args):
@@ -143,12 +120,8 @@ def add_samples(verbs: argparse._SubParsersAction) -> None:
     )
     files = output_folder("electrodes.txt", "forces.txt", "log.csv")
     verb.add_argument("out", type=files, metavar="DIR", help="folder to make")
-    verb.add_argument(
-        "--seed",
-        type=SEED,
-        default=0,
-        help="seed of touches and noise; 0 is in the package, others take minutes of simulation",
-    )
+    text = "seed of touches and noise; 0 is in the package, others take minutes of simulation"
+    verb.add_argument("--seed", type=SEED, default=0, help=text)
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
@@ -173,18 +146,11 @@ def add_view(verbs: argparse._SubParsersAction) -> None:
         "double-click the ball, then drag with ctrl and right button.",
     )
     add_skin(verb)
+    text = "write a picture of the ball lying on the pad instead of opening a window"
+    verb.add_argument("--render", type=output_file(picture=True), metavar="FILE", help=text)
+    text = "how long to simulate before --render"
     verb.add_argument(
-        "--render",
-        type=output_file(picture=True),
-        metavar="FILE",
-        help="write a picture of the ball lying on the pad instead of opening a window",
-    )
-    verb.add_argument(
-        "--seconds",
-        type=quantity("time", 60.0, 0.0),
-        default="300ms",
-        metavar="TIME",
-        help="how long to simulate before --render",
+        "--seconds", type=quantity("time", 60.0, 0.0), default="300ms", metavar="TIME", help=text
     )
     _add_hand(verb)
 
@@ -221,22 +187,17 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
         "sliders for depth and place (coarse skin, condensed tier), or of a policy that does a task by "
         "touch, with the BioTacs that it learned with (extra web). Settings of the skin replace these.",
     )
-    verb.add_argument(
-        "recording",
-        nargs="*",
-        metavar="FILE",
-        help=f"skin.h5 of presses, one or several; or a task: {', '.join(TASKS)}",
-    )
+    text = f"skin.h5 of presses, one or several; or a task: {', '.join(TASKS)}"
+    verb.add_argument("recording", nargs="*", metavar="FILE", help=text)
     add_skin(verb)
     verb.set_defaults(skin=None, tier=None, material=None)
     _add_hand(verb)
     verb.add_argument("--port", type=whole(1, 65535), help="port of the page (default: 8080)")
-    verb.add_argument(
-        "--policy",
-        metavar="FILE",
-        help="in a task, what acts (default: the policy that comes with the package); script uses "
-        "the true state, random draws actions; electrodes is that of roll_rod without PAC",
+    text = (
+        "in a task, what acts (default: the policy that comes with the package); script uses "
+        "the true state, random draws actions; electrodes is that of roll_rod without PAC"
     )
+    verb.add_argument("--policy", metavar="FILE", help=text)
     verb.add_argument(
         "--episodes", type=whole(1, 100000), help="in a task, number of episodes to score without a picture"
     )
@@ -310,12 +271,8 @@ def add_mount(verbs: argparse._SubParsersAction) -> None:
         ("pos", "of the BioTac's frame [m] (default: it ends where the link ends)"),
     ):
         verb.add_argument(f"--{name}", type=real(-1e3, 1e3), nargs=3, metavar=("X", "Y", "Z"), help=text)
-    verb.add_argument(
-        "--replaces",
-        nargs="*",
-        metavar="GEOM",
-        help="geoms that the BioTac replaces (default: all of the link)",
-    )
+    text = "geoms that the BioTac replaces (default: all of the link)"
+    verb.add_argument("--replaces", nargs="*", metavar="GEOM", help=text)
     verb.add_argument(
         "--out", type=output_file(), default="mount.yaml", metavar="FILE", help="file of the mounts"
     )
@@ -329,12 +286,8 @@ def add_import_mesh(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "path", metavar="PATH", help="folder with .tet and .obj files, or a .tet, .msh, .vtu ... file"
     )
-    verb.add_argument(
-        "--out",
-        type=output_file(".npz"),
-        metavar="FILE.npz",
-        help="where to store it (default: PATH's name with .npz, in the current folder)",
-    )
+    text = "where to store it (default: PATH's name with .npz, in the current folder)"
+    verb.add_argument("--out", type=output_file(".npz"), metavar="FILE.npz", help=text)
 
 
 def _import_mesh(args):

@@ -20,56 +20,35 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--rate", type=real(1e-3, 4400.0), default=20.0, metavar="HZ", help="rate of the time steps"
     )
+    text = "number with counts of the synthetic measured sensor too (default: 359)"
+    verb.add_argument("--labelled", type=whole(0, 10_000_000), help=text)
+    text = f"what touches: {', '.join(OBJECTS)}, geom:TYPE:SIZE[,SIZE...] or mesh:FILE"
+    verb.add_argument("--objects", nargs="+", default=list(OBJECTS), metavar="NAME", help=text)
+    text = "how it moves"
     verb.add_argument(
-        "--labelled",
-        type=whole(0, 10_000_000),
-        help="number with counts of the synthetic measured sensor too (default: 359)",
+        "--kinds", nargs="+", default=list(INTERACTIONS), choices=INTERACTIONS, metavar="KIND", help=text
     )
-    verb.add_argument(
-        "--objects",
-        nargs="+",
-        default=list(OBJECTS),
-        metavar="NAME",
-        help=f"what touches: {', '.join(OBJECTS)}, geom:TYPE:SIZE[,SIZE...] or mesh:FILE",
-    )
-    verb.add_argument(
-        "--kinds",
-        nargs="+",
-        default=list(INTERACTIONS),
-        choices=INTERACTIONS,
-        metavar="KIND",
-        help="how it moves",
-    )
-    verb.add_argument(
-        "--element",
-        choices=("linear", "quadratic"),
-        help="element of the skin (default: the material's, or the mesh's)",
-    )
+    text = "element of the skin (default: the material's, or the mesh's)"
+    verb.add_argument("--element", choices=("linear", "quadratic"), help=text)
     verb.add_argument(
         "--batch", type=whole(1, 100_000), default=160, help="most worlds in a batch; a shard holds one batch"
     )
-    verb.add_argument(
-        "--measured-batch",
-        type=whole(1, 100_000),
-        default=90,
-        help="the same for batches with the synthetic measured sensor",
-    )
+    text = "the same for batches with the synthetic measured sensor"
+    verb.add_argument("--measured-batch", type=whole(1, 100_000), default=90, help=text)
     verb.add_argument("--measured-seed", type=SEED, default=0, help="number of the synthetic measured sensor")
     verb.add_argument(
         "--measured-skin", help="mesh of the synthetic measured sensor (default: fine, of the skin's design)"
     )
-    verb.add_argument(
-        "--workers",
-        type=whole(0, 1024),
-        help="processes: on the CPU each makes whole shards, beside GPUs they compute readings (default: one "
-        "per core)",
+    text = (
+        "processes: on the CPU each makes whole shards, beside GPUs they compute readings (default: one "
+        "per core)"
     )
-    verb.add_argument(
-        "--vary",
-        metavar="JSON",
-        help="random values per interaction, JSON or a file of it: "
-        '{"youngs_modulus": [1e6, 2e6], "adhesion": [0, 0.1]}',
+    verb.add_argument("--workers", type=whole(0, 1024), help=text)
+    text = (
+        "random values per interaction, JSON or a file of it: "
+        '{"youngs_modulus": [1e6, 2e6], "adhesion": [0, 0.1]}'
     )
+    verb.add_argument("--vary", metavar="JSON", help=text)
     add_skin(verb, seed="of all random numbers: the same seed gives the same files on the same device")
     add_sensor(verb, "the objects are")
     add_ray(verb)
@@ -88,12 +67,8 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument("files", nargs="+", metavar="FILE", help="each becomes a shard")
     verb.add_argument("--force", metavar="FILE", help="forces row by row, text of 3 columns [N]")
-    verb.add_argument(
-        "--block",
-        type=quantity("time", 1e9, 1e-3),
-        metavar="TIME",
-        help="split into interactions of this length (and at gaps of half a second)",
-    )
+    text = "split into interactions of this length (and at gaps of half a second)"
+    verb.add_argument("--block", type=quantity("time", 1e9, 1e-3), metavar="TIME", help=text)
     verb.add_argument(
         "--objects", nargs="+", metavar="NAME", help="NVIDIA's files: names of indenter types 0, 1, ..."
     )
@@ -109,17 +84,10 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument("set", metavar="SET", help="folder of shards")
     verb.add_argument("--form", choices=("lerobot", "mujoco"), default="lerobot", help="layout of the files")
-    verb.add_argument(
-        "--measured",
-        action="store_true",
-        help="measured counts of interactions that have them, instead of simulated ones",
-    )
-    verb.add_argument(
-        "--rate",
-        type=real(0.1, 1e4),
-        metavar="HZ",
-        help="rate of LeRobot's frames, which hold the nearest rows (default: the set's)",
-    )
+    text = "measured counts of interactions that have them, instead of simulated ones"
+    verb.add_argument("--measured", action="store_true", help=text)
+    text = "rate of LeRobot's frames, which hold the nearest rows (default: the set's)"
+    verb.add_argument("--rate", type=real(0.1, 1e4), metavar="HZ", help=text)
     folder = output_folder(new="")
     verb.add_argument("--out", type=folder, required=True, metavar="DIR", help="folder to make")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")

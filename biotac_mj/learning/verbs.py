@@ -34,35 +34,21 @@ def _add_train(verbs, verb):
         "--force", metavar="FILE", help="force of a recording: text, 3 columns of force [N] row by row"
     )
     add_which(v)
-    v.add_argument(
-        "--out",
-        type=_model_or_folder,
-        default="out/train",
-        metavar="FILE|DIR",
-        help="FILE.safetensors, or a folder of predictions, errors and weights",
-    )
+    text = "FILE.safetensors, or a folder of predictions, errors and weights"
+    v.add_argument("--out", type=_model_or_folder, default="out/train", metavar="FILE|DIR", help=text)
     v.add_argument(
         "--fraction", type=real(0.2, 0.95), default=0.7, help="fraction of a recording, in time, for training"
     )
     v.add_argument("--seed", type=SEED, default=0, help="seed of one model's random numbers")
-    v.add_argument(
-        "--seeds",
-        type=SEED,
-        nargs="+",
-        help="seeds of divisions, weights and batches (default: 0 to 4, on a CPU 0)",
+    text = "seeds of divisions, weights and batches (default: 0 to 4, on a CPU 0)"
+    v.add_argument("--seeds", type=SEED, nargs="+", help=text)
+    text = (
+        "trajectory (72/18/10 %% of interactions), or the object held out for the test, several "
+        "with + (default: trajectory ring_7mm, on a CPU trajectory)"
     )
-    v.add_argument(
-        "--splits",
-        nargs="+",
-        metavar="NAME",
-        help="trajectory (72/18/10 %% of interactions), or the object held out for the test, several "
-        "with + (default: trajectory ring_7mm, on a CPU trajectory)",
-    )
-    v.add_argument(
-        "--paper",
-        action=argparse.BooleanOptionalAction,
-        help="latent projection and PointNet++, hours without a GPU (default: on a GPU)",
-    )
+    v.add_argument("--splits", nargs="+", metavar="NAME", help=text)
+    text = "latent projection and PointNet++, hours without a GPU (default: on a GPU)"
+    v.add_argument("--paper", action=argparse.BooleanOptionalAction, help=text)
     v.add_argument(
         "--config", metavar="FILE", help="JSON with settings of LearningConfig (docs/lab/learning.md)"
     )
@@ -171,13 +157,11 @@ def _add_judge(verbs, verb):
         "Evaluate models, with the mean or no change as baselines: networks on held-out data; or, on a "
         "recording of a real sensor, codes of its electrodes and regressions of its force.",
     )
-    v.add_argument(
-        "source",
-        nargs="?",
-        metavar="SOURCE",
-        help="a folder that `biotac learn train` wrote, or a recording: reconstruction is judged, force too "
-        "if it has one; with --model, a recording with force or a set",
+    text = (
+        "a folder that `biotac learn train` wrote, or a recording: reconstruction is judged, force too "
+        "if it has one; with --model, a recording with force or a set"
     )
+    v.add_argument("source", nargs="?", metavar="SOURCE", help=text)
     v.add_argument(
         "--model", metavar="FILE.safetensors", help="of `biotac learn train`, to be judged on SOURCE"
     )
@@ -186,31 +170,22 @@ def _add_judge(verbs, verb):
         "--force", metavar="FILE", help="force of a recording: text, 3 columns of force [N] row by row"
     )
     add_which(v)
-    v.add_argument(
-        "--new-sensor",
-        metavar="SET",
-        help="labelled set of another sensor: error of the film and of --weights, after a mixing of their "
-        "electrodes was fitted to 0, 5, 20 of its touches",
+    text = (
+        "labelled set of another sensor: error of the film and of --weights, after a mixing of their "
+        "electrodes was fitted to 0, 5, 20 of its touches"
     )
+    v.add_argument("--new-sensor", metavar="SET", help=text)
     v.add_argument(
         "--weights", metavar="FILE", help="forward model for --new-sensor (default: latent_projection)"
     )
-    v.add_argument(
-        "--sensor",
-        type=output_file(),
-        metavar="FILE.yaml",
-        help="with --new-sensor, file for the adapted sensor, which attach(effects=FILE) takes",
-    )
+    text = "with --new-sensor, file for the adapted sensor, which attach(effects=FILE) takes"
+    v.add_argument("--sensor", type=output_file(), metavar="FILE.yaml", help=text)
     v.add_argument(
         "--fraction", type=real(), default=0.7, help="fraction of the recording, in time, for training"
     )
     v.add_argument("--seed", type=SEED, default=0, help="seed of the recording's networks")
-    v.add_argument(
-        "--json",
-        type=output_file(),
-        metavar="FILE",
-        help="file of the results, with a plot (default: out/judge/..., or in the folder)",
-    )
+    text = "file of the results, with a plot (default: out/judge/..., or in the folder)"
+    v.add_argument("--json", type=output_file(), metavar="FILE", help=text)
     v.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
@@ -336,32 +311,28 @@ def _add_predict(verbs, verb):
         "Predict from a recording: force, contact position and electrodes with intervals and novelty; "
         "or, with inverse weights, deformation and contact of the skin.",
     )
-    v.add_argument(
-        "model",
-        metavar="MODEL",
-        help="what `biotac learn train --out FILE.safetensors` wrote; or inverse weights: of those that come "
-        "with the package and saw synthetic data alone, inverse (with force) or latent_projection",
+    text = (
+        "what `biotac learn train --out FILE.safetensors` wrote; or inverse weights: of those that come "
+        "with the package and saw synthetic data alone, inverse (with force) or latent_projection"
     )
+    v.add_argument("model", metavar="MODEL", help=text)
     v.add_argument(
         "source", metavar="FILE", help="a recording; of a model that predicts electrodes, a set with its skin"
     )
     add_which(v)
     add_load_arguments(v)
     _add_tare(v)
-    v.add_argument(
-        "--row",
-        type=int,
-        help="with inverse weights, number of the row to draw, -1 the last (default: the largest force's; "
-        "where none was recorded, the one that differs most from rest)",
+    text = (
+        "with inverse weights, number of the row to draw, -1 the last (default: the largest force's; "
+        "where none was recorded, the one that differs most from rest)"
     )
+    v.add_argument("--row", type=int, help=text)
     v.add_argument("--skin", default="default", help="mesh of inverse weights; of latent_projection any")
-    v.add_argument(
-        "--out",
-        type=_table_or_folder,
-        metavar="FILE|DIR",
-        help="table .csv or .h5 (default: out/predict.csv); of inverse weights the folder of contact.png and "
-        "contact.json (default: out/contact)",
+    text = (
+        "table .csv or .h5 (default: out/predict.csv); of inverse weights the folder of contact.png and "
+        "contact.json (default: out/contact)"
     )
+    v.add_argument("--out", type=_table_or_folder, metavar="FILE|DIR", help=text)
 
 
 def _predict(args):

@@ -55,24 +55,15 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     )
     source.add_argument("--serial", metavar="PORT", help="as /dev/ttyUSB0, each line a row of numbers")
     v.add_argument("--baud", type=whole(50, 10**8), default=115200, help="baud rate of --serial")
-    v.add_argument(
-        "--columns",
-        nargs="+",
-        metavar="NAME",
-        help="names in --serial's lines, as time e1 e2 pdc (default: a header, or all electrodes in order)",
+    text = "names in --serial's lines, as time e1 e2 pdc (default: a header, or all electrodes in order)"
+    v.add_argument("--columns", nargs="+", metavar="NAME", help=text)
+    text = "duration (default: 10s, or that of the protocol)"
+    v.add_argument("--seconds", type=quantity("time", 1e6, 0.01), metavar="TIME", help=text)
+    text = (
+        "announce the steps of a checkup from this plan (`biotac checkup`); when each was done is "
+        "written beside the recording, as OUT_timeline.yaml"
     )
-    v.add_argument(
-        "--seconds",
-        type=quantity("time", 1e6, 0.01),
-        metavar="TIME",
-        help="duration (default: 10s, or that of the protocol)",
-    )
-    v.add_argument(
-        "--protocol",
-        metavar="FILE.yaml",
-        help="announce the steps of a checkup from this plan (`biotac checkup`); when each was done is "
-        "written beside the recording, as OUT_timeline.yaml",
-    )
+    v.add_argument("--protocol", metavar="FILE.yaml", help=text)
     v.add_argument("--object", metavar="NAME", help="name of the touching object")
     v.add_argument("--out", type=recording, required=True, metavar="FILE.h5", help="file to write")
 

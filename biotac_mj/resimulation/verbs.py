@@ -24,12 +24,8 @@ def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Arg
     v.add_argument("--force", metavar="FILE", help="its forces: text, 3 columns [N] row by row")
     add_which(v)
     add_load_arguments(v, "object: a name of `biotac data generate --objects`, geom:... or mesh:FILE")
-    v.add_argument(
-        "--poses",
-        choices=("recorded", "fitted"),
-        default="recorded",
-        help="recorded with the file, or fitted from force and electrodes: a plate pressed by hand",
-    )
+    text = "recorded with the file, or fitted from force and electrodes: a plate pressed by hand"
+    v.add_argument("--poses", choices=("recorded", "fitted"), default="recorded", help=text)
     for name, text in (
         ("mount", "pose of the BioTac frame in the frame of the sensor's recorded pose (default: the same)"),
         ("object-pose", "of a stationary object without recorded pose"),
@@ -43,12 +39,8 @@ def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Arg
     )
     v.add_argument("--skin", help="mesh of the skin (default: the default of the recording's design)")
     v.add_argument("--material", default="default", help="preset, .json file or JSON of the rubber")
-    v.add_argument(
-        "--liquid",
-        action=argparse.BooleanOptionalAction,
-        default=None,
-        help="liquid under the skin (default: the material's)",
-    )
+    text = "liquid under the skin (default: the material's)"
+    v.add_argument("--liquid", action=argparse.BooleanOptionalAction, default=None, help=text)
     v.add_argument("--options", metavar="JSON", help="further settings of the skin (docs/features.md)")
     v.add_argument("--batch", type=whole(1, 10_000), default=8, help="touches in a shard, parallel on a GPU")
     v.add_argument("--workers", type=whole(0, 1024), help="processes for the readings (default: one a core)")
