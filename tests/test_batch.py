@@ -129,16 +129,14 @@ def read(mjm, d, channel):
 def test_readings_hold_in_the_world_that_did_not_get_there(tier):
     """They are those of the last step in which its skin reached the ball, as with `mj_step`."""
     mjm, m, d, _ = make(press_spec(), 2, tier=tier, readings={"noise": False})
-    start = places(2)
-    deep = np.ones(2)
-    for step in range(16):
-        if step == 10:
-            before, deep = readings_of(mjm, d), np.array([1, 8])
-        for _ in press(m, d, start, 1, 1e-3 * deep):
-            pass
-    status = read(mjm, d, "status")
-    assert status[:, 1].tolist() == [0, 6] and np.ptp(before, axis=0).max() > 20
-    np.testing.assert_array_equal(readings_of(mjm, d)[1], before[1])
+    kept = []
+    for steps, deep in ((1, [-1, -1]), (10, [1, 1]), (6, [1, 8])):
+        for _ in range(steps):
+            assert list(press(m, d, places(2), 1, 1e-3 * np.array(deep))) == [1]
+        kept.append(readings_of(mjm, d))
+    rest, before, after = kept
+    assert read(mjm, d, "status")[:, 1].tolist() == [0, 6] and abs(before - rest).max() > 10
+    np.testing.assert_array_equal(after[1], before[1])
 
 
 def readings_of(mjm, d):
