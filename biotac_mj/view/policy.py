@@ -45,7 +45,7 @@ def play_task(
         that uses the true state; "random".
       episodes: number of episodes to score, in parallel worlds; None: show episodes one after the other.
       json: print scores as JSON. render: GIF of episodes. window: MuJoCo's viewer instead of the page at
-      `port` (8080).
+        `port` (8080).
       seed: of initial states. hand: for the rod's task.
       biotac: settings of the BioTacs, as `batch.attach` has them, in place of those that the policy learned
         with; its card is not compared then.
