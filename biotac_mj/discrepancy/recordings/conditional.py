@@ -6,8 +6,6 @@ this. With the precision P of all columns, the residual of an electrode given al
 with a standard deviation of 1 / sqrt(P_kk); and the amplitude of a common pattern p has the minimum-variance
 estimate p'P y / p'P p."""
 
-import functools
-
 import numpy as np
 
 
@@ -59,14 +57,6 @@ class Conditional:
     def noise(self) -> np.ndarray:
         """(c,) standard deviation of an electrode given the others."""
         return 1 / np.sqrt(np.diag(self.precision)[: self.number])
-
-    @functools.cached_property
-    def weights(self) -> np.ndarray:
-        """(c, q) coefficients that predict each electrode from all other columns."""
-        P = self.precision[: self.number]
-        weights = -P / np.diag(P)[:, None]
-        np.fill_diagonal(weights, 0.0)
-        return weights
 
     def residual(self, rows: np.ndarray) -> np.ndarray:
         """(n, c) residuals of the electrodes of rows (n, q), given all other columns."""

@@ -14,7 +14,6 @@ from .conditional import Components, Conditional
 _BIN = 0.1  # [s]: load moves by hand, below 10 Hz
 _CELLS = 48  # of the rows fitted, whose levels are compared
 WINDOW = (2.0, 4.0)  # [s] within which a change is load: at least and at most
-CHANGES = 1.5  # [s] within which an electrode's changes are compared with their prediction from the others
 LEAST = 16.0  # [s] fitted, in which load and drift can be separated: eight windows
 _MOVED = 6.0  # [counts] within windows, of the six liveliest electrodes
 _DIMENSIONS = 8  # of the load at most
@@ -121,18 +120,6 @@ class Model:
         """(m, c + products) with other levels (m, c)."""
         c = len(self.used)
         return self.whole if value is None else np.concatenate([value, self.whole[:, c:]], axis=1)
-
-    def moments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Moments (w, q, q) of changes of electrodes and products within windows of the fitted bins, floor
-        (q,) of a window's noise, and centres (w,) [s]."""
-        whole = self.whole[self.inside]
-        span = max(4, int(min(CHANGES / self.period, len(whole) // 32)))
-        w = len(whole) // span
-        cells = whole[: w * span].reshape(w, span, -1)
-        cells = cells - cells.mean(1, keepdims=True)
-        floor = np.concatenate([self.noise**2, np.full(whole.shape[1] - len(self.used), _FLOOR)]) * span
-        middle = self.time[: w * span].reshape(w, span).mean(1)
-        return np.einsum("wsi,wsj->wij", cells, cells), floor, middle
 
     def levels(self, series: np.ndarray, every: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Means (w, ...) of a series (m, ...) over cells, of the bins fitted or of all, and the cells' times

@@ -32,10 +32,6 @@ _MATCH, _BINS = 0.05, 1000
 # anything where the load never is
 _KEPT = 0.5
 _MOST = 4  # edges of an electrode: one with more switches, and ends as unknown
-# logarithm of a gain in ln Z that an offset in counts looks like: the divider's curve, over 300 counts
-_CURVED = 0.18
-# standard errors of a gain: with less a level alone has changed, with more nothing is known of the gain
-_SURE, _UNSURE = 0.2, 0.5
 
 
 class Edge(typing.NamedTuple):
@@ -190,32 +186,10 @@ def jumped(session: Session) -> list[Candidate]:
                     "edge": float(np.log(max(e.times for e in mine))),
                     "isolation": float(np.log(max(e.isolation for e in mine))),
                 },
-                ties=_gains(session, k, at[0]),
+                # where nothing moves a gain would have no effect
+                ties=("gain", "flip") if session.loaded else (),
                 correct=correct,
                 verified=True,
             )
         )
     return out
-
-
-def _gains(session, k, since):
-    """Ids of what a jump of electrode k at a time [s] may be besides a level: a change of its gain from then
-    on, relative to its conditional prediction within windows."""
-    m = session.model()
-    if not m.dimensions or k not in m.used:
-        return ()  # nothing moves: an offset; a gain would have no effect
-    i = int(np.flatnonzero(m.used == k)[0])
-    moment, floor, middle = m.moments()
-    after = middle > since
-    if min(after.sum(), (~after).sum()) < 2:
-        return ("gain", "flip")
-    weight = Conditional(moment[~after].mean(0), floor).weights[i]
-    said, own = np.einsum("wij,i,j->w", moment, weight, weight), moment[:, i] @ weight
-    gain = own[after] / np.maximum(said[after], 1e-12)
-    middle = float(np.average(gain, weights=said[after]))
-    error = np.sqrt(np.average((gain - middle) ** 2, weights=said[after]) / len(gain)) + 0.05
-    if error > _UNSURE and abs(middle - 1) < 2 * error:
-        return ("gain", "flip")
-    if middle > 0 and error < _SURE and abs(np.log(middle)) < _CURVED:
-        return ()
-    return ("gain",) if middle > 0 else ("flip",)
