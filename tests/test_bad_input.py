@@ -682,10 +682,10 @@ def weights_of_networks():
     yield Row(PATCH, "cannot read skin 'default'", "inverse.safetensors", weights(nvert=3))
     yield Row(PATCH, "was trained with channels a", "inverse.safetensors", weights(channels=["a"]))
     yield Row(PATCH, "outer nodes, the skin has", "inverse.safetensors", weights(nouter=3))
-    yield Row(PATCH, "has no intervals: write it with", "inverse.safetensors", weights(direction="forward"))
+    yield Row(PATCH, "holds no model that reads", "inverse.safetensors", weights(direction="forward"))
     yield Row(PATCH, "is no file of weights", "inverse.safetensors", cut)
     yield Row(PATCH, "is no file of weights", "inverse.safetensors", text(""))
-    yield Row(PATCH.replace("inverse", "forward"), "has no intervals: write it with")
+    yield Row(PATCH.replace("inverse", "forward"), "holds no model that reads electrodes")
     yield Row(PATCH.replace("inverse.safetensors", "nowhere"), "no file of weights at nowhere")
     yield Row(f"{PATCH} --skin coarse", "cannot read skin 'coarse'")
     yield Row("learn judge --new-sensor shard.h5 --weights force.txt", "force.txt is no file of weights")
@@ -726,20 +726,7 @@ def trained_models():
     yield Row("learn judge trained --sensor own.yaml", "--sensor goes with --new-sensor")
     yield Row("learn train electrodes.txt --force force.txt --out a", "go with one model: give --out FILE")
     yield Row("learn predict force.txt electrodes.txt", "force.txt is no file of weights")
-    file, intervals = "forward.safetensors", {"half": [1.0] * 19, "usual": 1.0, "level": 0.9}
-    forward = f"learn predict {file} shard.h5"
-    for name, said in (
-        ("level", f"description of {file} has no level: add"),
-        ("usual", f"description of {file} has no usual: add"),
-    ):
-        yield Row(forward, said, file, weights(**(intervals | {name: None})))
-    for entry_, said in (
-        ({"level": "zzz"}, f"level of the description of {file} is 'zzz': pass a number"),
-        ({"level": 90}, "is 90: a share between 0 and 1"),
-        ({"half": [1.0]}, "has 1 numbers, 19 are needed"),
-        ({"half": "no"}, f"half of the description of {file} is 'no': pass a list"),
-    ):
-        yield Row(forward, said, file, weights(**(intervals | entry_)))
+    file = "forward.safetensors"
     yield Row(
         f"learn predict {file} electrodes.txt",
         "it describes itself by [1]",
@@ -748,7 +735,7 @@ def trained_models():
     )
     for name, said in (("p.txt", "ends in none of .csv"), ("force.txt/a.csv", "force.txt is a file")):
         yield Row(f"learn predict forward.safetensors electrodes.txt --out {name}", said)
-    yield Row("learn predict forward.safetensors electrodes.txt", "has no intervals: write it with")
+    yield Row("learn predict forward.safetensors electrodes.txt", "holds no model that reads electrodes")
     for words, said in (
         ("--object spoon", "unknown object 'spoon'"),
         ("--object sphere_7mm", "has no pose of the object"),

@@ -17,6 +17,7 @@ from biotac_mj.geometry import load_skin  # noqa: E402
 from biotac_mj.learning.networks.points import SkinPoints  # noqa: E402
 from biotac_mj.learning.patch import estimate  # noqa: E402
 from biotac_mj.learning.serve import LearnedBatchFilm, NetworkFilm  # noqa: E402
+from biotac_mj.learning.training.local import counts_change  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse, shipped  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS  # noqa: E402
 
@@ -139,6 +140,12 @@ def test_a_set_holds_what_the_network_reads():
     np.testing.assert_allclose(found.impedance[0], film.rest, rtol=1e-6)
 
 
+def _counts(forward, u):
+    """Counts of the first sensor for displacements [mm]."""
+    tare = torch.tensor(REST_COUNTS["1"], dtype=torch.float32)
+    return (counts_change(forward.log_change(u), tare) + tare).numpy()
+
+
 @pytest.mark.parametrize("name", SKINS)
 def test_electrodes_say_where_the_skin_is_pressed(name):
     """Forward and back: the network's own readings of a dent, at two places of the pad."""
@@ -147,7 +154,7 @@ def test_electrodes_say_where_the_skin_is_pressed(name):
     centre = []
     for x in (-14e-3, -7e-3):
         u = torch.tensor(1e3 * pressed(skin, x)[None], dtype=torch.float32)
-        counts = forward.counts(u, REST_COUNTS["1"]).numpy().clip(0, 4095)
+        counts = _counts(forward, u).clip(0, 4095)
         found = estimate(counts, REST_COUNTS["1"], skin, NAME)
         assert found.displacement.shape == (1, skin.nvert, 3) and not found.is_force
         push = found.contact[0]
@@ -161,7 +168,7 @@ def test_predict_takes_the_inverse_projection(tmp_path, capsys):
     skin = load_skin("coarse")
     forward = load_forward(shipped(NAME), skin)
     u = torch.tensor(1e3 * np.stack([0 * skin.vert, pressed(skin)]), dtype=torch.float32)
-    table = forward.counts(u, REST_COUNTS["1"]).numpy().round().clip(0, 4095)
+    table = _counts(forward, u).round().clip(0, 4095)
     head = "time," + ",".join(f"e{k + 1}" for k in range(19))
     rows = [f"{0.1 * k:.2f}," + ",".join(f"{v:.0f}" for v in row) for k, row in enumerate(table)]
     (tmp_path / "log.csv").write_text("\n".join([head, *rows]) + "\n")

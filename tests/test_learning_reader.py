@@ -306,7 +306,7 @@ def test_commands_keep_a_model_and_use_it(tmp_path, capsys):
     assert cli.main(["learn", "predict", model, rec, "--out", str(tmp_path / "p.txt")]) == 2
     assert "ends in none of .csv" in capsys.readouterr().err
     assert cli.main(["learn", "predict", str(shipped("forward")), rec, "--out", str(tmp_path / "q.csv")]) == 2
-    assert "has no intervals: write it with" in capsys.readouterr().err
+    assert "holds no model that reads electrodes" in capsys.readouterr().err
     with pytest.raises(ValueError, match="neither force nor contact place"):
         from_recording(dataclasses.replace(one, force=None))
 

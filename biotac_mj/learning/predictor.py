@@ -12,7 +12,6 @@ from .networks.points import SkinPoints
 from .training.arrays import Arrays
 from .training.config import LearningConfig
 from .training.features import FilmFeatures, Pod
-from .training.local import counts_change
 from .training.paper import network_change
 
 
@@ -32,12 +31,6 @@ class _Served(nn.Module):
                 "displacement holds values that are not finite: the skin's step did not converge; "
                 "keep the last good state"
             )
-
-    def counts(self, displacement: torch.Tensor, tare: np.ndarray | torch.Tensor) -> torch.Tensor:
-        """(n, nelectrode) fractional counts for displacements (n, nvert, 3) [mm] and counts at rest, tare
-        (nelectrode,) or (n, nelectrode)."""
-        tare = torch.as_tensor(tare, dtype=torch.float32, device=displacement.device)
-        return counts_change(self.log_change(displacement), tare) + tare
 
 
 class PointsModel(_Served):

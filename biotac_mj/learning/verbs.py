@@ -25,11 +25,10 @@ def _add_train(verbs, verb):
         "train",
         _train,
         "Train on SOURCE. Into one FILE.safetensors: of a recording with force, or of a set, a model that "
-        "reads force and place from electrodes; of a folder of trained networks the best one that predicts "
-        "electrodes, for attach(signal=FILE). Into a folder: all networks on a labelled set, continued if it "
-        "was interrupted.",
+        "reads force and place from electrodes. Into a folder: all networks on a labelled set, continued if "
+        "it was interrupted; attach(signal=FILE) takes their weights from there.",
     )
-    v.add_argument("source", metavar="SOURCE", help="a recording, a set, or a folder of trained networks")
+    v.add_argument("source", metavar="SOURCE", help="a recording, or a set")
     v.add_argument(
         "--force", metavar="FILE", help="force of a recording: text, 3 columns of force [N] row by row"
     )
@@ -97,11 +96,9 @@ def _train_one(args):
 
         return _save_reader(args, *judge(from_set(source), args.seed))
     if any(source.glob("*-*.npz")):
-        from .instants.predict import save_forward_model
-
-        save_forward_model(source, args.out)
-        print(f"written: {args.out}; use it with attach(signal={str(args.out)!r})")
-        return
+        raise ValueError(
+            f"{source} holds trained networks: attach(signal=FILE) takes its *.safetensors as they are"
+        )
     from ..recordings import load_one
     from .instants.examples import from_recording
     from .instants.reader import judge_in_time
@@ -316,9 +313,7 @@ def _add_predict(verbs, verb):
         "with the package and saw synthetic data alone, inverse (with force) or latent_projection"
     )
     v.add_argument("model", metavar="MODEL", help=text)
-    v.add_argument(
-        "source", metavar="FILE", help="a recording; of a model that predicts electrodes, a set with its skin"
-    )
+    v.add_argument("source", metavar="FILE", help="a recording")
     add_which(v)
     add_load_arguments(v)
     _add_tare(v)

@@ -246,13 +246,6 @@ def _refuse_other(meta, path, geometry, direction):
         )
 
 
-def amend(source: pathlib.Path | str, target: pathlib.Path | str, more: dict) -> None:
-    """Copies a file of weights with further entries in its description; more: JSON types."""
-    from safetensors.torch import load
-
-    write_tensors(target, load(pathlib.Path(source).read_bytes()), describe(source) | more)
-
-
 def load_forward(path: pathlib.Path | str, geometry: SkinGeometry) -> ForwardModel | PointsModel:
     """A `predictor.ForwardModel`, or, for a network that reads `SkinPoints`, a `predictor.PointsModel`.
 

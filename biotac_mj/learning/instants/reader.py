@@ -154,7 +154,12 @@ class Reader:
                 f"{path} holds no model that reads electrodes: it says {meta.get('format')}, "
                 f"{meta.get('direction')}; write one with `biotac learn train`"
             )
-        check_intervals(path, meta, {"tared": bool})
+        check_entries(f"the description of {path}", meta, {"level": float, "tared": bool})
+        if not 0 < meta["level"] < 1:
+            raise ValueError(
+                f"level of the description of {path} is {meta['level']:g}: a share between 0 and 1 is "
+                "needed; write it anew with `biotac learn train`"
+            )
         one = cls(meta, {name: np.asarray(value, float) for name, value in tensors.items()})
         try:
             n = len(one.electrodes)
@@ -164,17 +169,6 @@ class Reader:
                 f"{path} does not fit together ({error}): it is damaged or an older version's, write it anew"
             ) from None
         return one
-
-
-def check_intervals(path: pathlib.Path | str, meta: dict, also: dict[str, type]) -> None:
-    """Raises ValueError if a model's description has no level of its intervals, or lacks an entry of `also`
-    or has one of another type."""
-    check_entries(f"the description of {path}", meta, {"level": float} | also)
-    if not 0 < meta["level"] < 1:
-        raise ValueError(
-            f"level of the description of {path} is {meta['level']:g}: a share between 0 and 1 is needed; "
-            "write it anew with `biotac learn train`"
-        )
 
 
 def _stored(name, one):
