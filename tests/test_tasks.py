@@ -15,6 +15,7 @@ pytest.importorskip("dm_control", reason="needs dm_control (extra control)")
 
 # ruff: noqa: E402
 from dm_control import composer, mjcf
+from fit_estimators import fit_estimator
 
 import biotac_mj
 from biotac_mj.sensor.channels import REST_COUNTS
@@ -314,12 +315,12 @@ def test_estimator_recovers_a_map_and_names_its_error():
     shape = 10 * x / (np.abs(x).sum(axis=1, keepdims=True) + 1)
     truth = np.stack([1 + 2 * x[:, 3] - shape[:, 0] * shape[:, 5], shape[:, 19] ** 2 - x[:, 7]], axis=1)
     episode = np.repeat(range(8), 250)
-    fit = touch.Estimator.fit(x, truth, episode)
+    fit = fit_estimator(x, truth, episode)
     np.testing.assert_allclose(fit(x[:5]), truth[:5], atol=2e-3)
-    noisy = touch.Estimator.fit(x, truth + 0.3 * rng.standard_normal(truth.shape), episode)
+    noisy = fit_estimator(x, truth + 0.3 * rng.standard_normal(truth.shape), episode)
     np.testing.assert_allclose(noisy.error, 0.3, rtol=0.15)
     with pytest.raises(ValueError, match="3 episodes: a fit needs four"):
-        touch.Estimator.fit(x[:300], truth[:300], np.repeat(range(3), 100))
+        fit_estimator(x[:300], truth[:300], np.repeat(range(3), 100))
 
 
 def test_every_estimator_says_what_it_was_fitted_on():

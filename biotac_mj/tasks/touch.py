@@ -7,7 +7,6 @@ import importlib.resources
 import json
 import typing
 import warnings
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -65,7 +64,7 @@ class Touch:
         return self._value.copy()
 
 
-def _features(touch):
+def features(touch):
     """(n, 251) features of (n, 20): the touch, and constant, linear and quadratic terms of its normalised
     shape."""
     shape = 10 * touch / (np.abs(touch).sum(axis=1, keepdims=True) + 1.0)
@@ -73,10 +72,10 @@ def _features(touch):
     return np.concatenate([np.ones((len(touch), 1)), shape, shape[:, i] * shape[:, j], touch], axis=1)
 
 
-# not `learning.instants.linear`: its fits need scikit-learn, which tasks do without
 @dataclasses.dataclass(frozen=True)
 class Estimator:
-    """Ridge regression of hidden quantities on one BioTac's touch and quadratic features of its shape.
+    """Ridge regression of hidden quantities on one BioTac's touch and quadratic features of its shape, fitted
+    by `scripts/fit_estimators.py`.
 
     Attributes:
       scale: (251,) of the features; weight: (251, nestimated); error: (nestimated,) RMS on held-out episodes.
@@ -88,39 +87,7 @@ class Estimator:
 
     def __call__(self, touch) -> np.ndarray:
         """(nbiotac, nestimated) of (nbiotac, 20)."""
-        return (_features(touch) / self.scale) @ self.weight
-
-    @classmethod
-    def fit(
-        cls,
-        touch: np.ndarray,
-        hidden: np.ndarray,
-        episode: np.ndarray,
-        ridges: Sequence[float] = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0),
-    ) -> "Estimator":
-        """Fits to samples touch (n, 20), hidden (n, k) of episodes (n,), with the ridge of least error on
-        every fourth episode.
-
-        Raises:
-          ValueError: fewer than four episodes.
-        """
-        if len(np.unique(episode)) < 4:
-            raise ValueError(f"{len(np.unique(episode))} episodes: a fit needs four, one of them to test it")
-        feature = _features(touch)
-        scale = np.sqrt((feature**2).mean(0)) + 1e-9
-        spread = hidden.std(0) + 1e-12
-        test = np.isin(episode, np.unique(episode)[::4])
-
-        def solve(rows, ridge):
-            a = feature[rows] / scale
-            return np.linalg.solve(a.T @ a + ridge * np.eye(a.shape[1]), a.T @ hidden[rows])
-
-        def error(weight):
-            return np.sqrt((((feature[test] / scale) @ weight - hidden[test]) ** 2).mean(0))
-
-        errors = [error(solve(~test, ridge)) for ridge in ridges]
-        best = int(np.argmin([(e / spread).sum() for e in errors]))
-        return cls(scale, solve(np.ones(len(test), bool), ridges[best]), errors[best])
+        return (features(touch) / self.scale) @ self.weight
 
 
 class CalibrationWarning(UserWarning):
