@@ -240,10 +240,12 @@ def measure_fits(names: list, fill: float) -> dict:
     if fill:
         body = dataclasses.replace(body, options=dataclasses.replace(exact, fill_volume=fill / 2))
     out = {"parameters": [p.name for p in names]}
-    several = functools.partial(differentiable.calibrate, starts=4)
-    fits = {"gradients": differentiable.calibrate, "differences": calibrate}
+    fits = {
+        "gradients": functools.partial(calibrate, forces=differentiable.Forces()),
+        "differences": calibrate,
+    }
     if fill:
-        fits["four_starts"] = several
+        fits["four_starts"] = functools.partial(calibrate, forces=differentiable.Forces(), starts=4)
     for name, fit in fits.items():
         begin = time.process_time()
         found = fit(body, START, data, names)

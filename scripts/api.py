@@ -38,7 +38,7 @@ SECTIONS = {
     "Gradients": """differentiable.Skin differentiable.press differentiable.Pressed differentiable.Changes
         differentiable.rollout differentiable.Rolled differentiable.impedance differentiable.electrode_counts
         differentiable.pdc_counts differentiable.temperatures differentiable.tdc_counts
-        differentiable.tac_counts differentiable.for_jax differentiable.calibrate""",
+        differentiable.tac_counts differentiable.for_jax differentiable.Forces""",
     "Calibration": "calibration.calibrate calibration.evaluate",
     "Pictures": "view.view view.build_scene view.Offscreen view.find_gl",
 }

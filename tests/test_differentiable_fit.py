@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from biotac_mj import calibration, cli, differentiable
+from biotac_mj import cli
 from biotac_mj.calibration import calibrate, configuration, parameter, plan_indentation, simulate
 from biotac_mj.calibration.fit import forces_and_jacobian
 from biotac_mj.calibration.indentation import write_indentation
@@ -43,7 +43,7 @@ def test_forces_are_those_of_the_fit_by_differences(shell, data):
 
 @pytest.mark.slow  # quick: the verb finds friction
 def test_recovers_stiffness_and_friction(shell, data):
-    found = differentiable.calibrate(shell, START, data, ["E", "mu"], max_iterations=8)
+    found = calibrate(shell, START, data, ["E", "mu"], max_iterations=8, forces=Forces())
     assert found.success and not found.nonconverged
     assert found.value == pytest.approx([TRUTH.youngs_modulus, TRUTH.friction], rel=1e-3)
 
@@ -77,7 +77,7 @@ def test_slopes_are_cached_bit_for_bit(shell, data, tmp_path, monkeypatch):
 
 def test_what_has_no_gradient_is_named(shell, data):
     with pytest.raises(ValueError, match="gradients by stick_ratio are not there: fit with calibration"):
-        differentiable.calibrate(shell, START, data, ["E", "stick_ratio:0.01:0.5"])
+        calibrate(shell, START, data, ["E", "stick_ratio:0.01:0.5"], forces=Forces())
 
 
 def test_differences_where_there_is_no_gradient(shell, data):
@@ -159,8 +159,7 @@ def test_a_start_that_promises_nothing_is_left(shell, data):
     assert (several.value == once.value).all()
 
 
-def test_both_fits_take_the_rest_by_name():
-    for fit in (calibration.calibrate, differentiable.calibrate):
-        parameters = inspect.signature(fit).parameters.values()
-        placed = [one.name for one in parameters if one.kind is one.POSITIONAL_OR_KEYWORD]
-        assert placed == ["configuration", "material", "indentation", "parameters"]
+def test_a_fit_takes_the_rest_by_name():
+    parameters = inspect.signature(calibrate).parameters.values()
+    placed = [one.name for one in parameters if one.kind is one.POSITIONAL_OR_KEYWORD]
+    assert placed == ["configuration", "material", "indentation", "parameters"]

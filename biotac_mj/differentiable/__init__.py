@@ -2,7 +2,7 @@
 
 from .estimation.belief import Belief, Touch
 from .estimation.estimate import Estimate, Estimator, change_of, pressure_change
-from .fit import calibrate
+from .fit import Forces
 from .loop.rollout import Rolled, rollout
 from .press import PARAMETERS, Pressed, press, relative_pose
 from .readings.counts import electrode_counts, pdc_counts, tac_counts, tdc_counts
@@ -18,11 +18,11 @@ __all__ = [
     "Changes",
     "Estimate",
     "Estimator",
+    "Forces",
     "Pressed",
     "Rolled",
     "Skin",
     "Touch",
-    "calibrate",
     "change_of",
     "electrode_counts",
     "for_jax",

@@ -1,14 +1,11 @@
-"""`calibrate` by gradients: one press gives the forces and their derivatives by all parameters; finite
-differences need a press for each."""
-
-from collections.abc import Sequence
+"""`calibration.calibrate` by gradients: one press gives the forces and their derivatives by all parameters;
+finite differences need a press for each."""
 
 import numpy as np
 import torch
 
 from ..cache import cached
-from ..calibration import Calibration, Configuration, FitParameter, Indentation
-from ..calibration import calibrate as calibrate_with
+from ..calibration import Configuration, FitParameter, Indentation
 from ..calibration.forward import CODE, Steps, inputs_of, steps_of
 from ..skin import Material
 from .press import PARAMETERS, numbers_of
@@ -20,8 +17,8 @@ _PRECISION = 1e-4  # of derivatives, which only set the direction
 
 
 class Forces:
-    """`calibration.fit.forces_and_jacobian` by gradients. Keeps the skin between calls, and caches results on
-    disk.
+    """Argument `forces` of `calibration.calibrate` for gradients, on the CPU: by E, nu, mu, fill_volume,
+    bulk_modulus, contact_stiffness. Keeps the skin between calls, and caches results on disk.
 
     Raises:
       ValueError: a parameter without gradient.
@@ -124,34 +121,3 @@ def forces_of(
     except ValueError as error:
         return None, f"differences ({str(error).partition(':')[0]})"
     return forces, "gradients"
-
-
-def calibrate(
-    configuration: Configuration,
-    material: Material,
-    indentation: Indentation,
-    parameters: Sequence[str | FitParameter] = ("E", "nu", "mu"),
-    *,
-    max_iterations: int = 20,
-    progress: bool = False,
-    starts: int = 1,
-) -> Calibration:
-    """`calibration.calibrate` by gradients, on the CPU: Gauss-Newton from the start.
-
-    Args:
-      configuration, material, indentation, max_iterations, progress, starts: see there.
-      parameters: E, nu, mu, fill_volume, bulk_modulus, contact_stiffness.
-
-    Raises:
-      ValueError: as `calibration.calibrate` and `Skin`, or a parameter without gradient.
-    """
-    return calibrate_with(
-        configuration,
-        material,
-        indentation,
-        parameters,
-        max_iterations=max_iterations,
-        progress=progress,
-        forces=Forces(),
-        starts=starts,
-    )
