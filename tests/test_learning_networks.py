@@ -10,7 +10,6 @@ from learning_set import dent  # noqa: E402
 from scipy.sparse import csr_matrix  # noqa: E402
 
 from biotac_mj.geometry import load_skin  # noqa: E402
-from biotac_mj.learning.networks.electrode_vae import ElectrodeVAE  # noqa: E402
 from biotac_mj.learning.networks.graph import ChebConv, SparseMatrix  # noqa: E402
 from biotac_mj.learning.networks.heads import LocalHead  # noqa: E402
 from biotac_mj.learning.networks.hierarchy import build_hierarchy  # noqa: E402
@@ -124,18 +123,6 @@ def test_mesh_vae_learns_and_has_the_papers_sizes(skin, levels):
         optimizer.zero_grad(), loss.backward(), optimizer.step()
         first = first or loss.item()
     assert loss.item() < 0.4 * first
-
-
-def test_the_electrode_vae_starts_near_principal_components():
-    torch.manual_seed(0)
-    x = torch.randn(500, 8) @ torch.randn(8, 19) + 0.01 * torch.randn(500, 19)
-    axes = torch.linalg.svd(x, full_matrices=False).Vh[:8]
-    net = ElectrodeVAE(19, linear=axes).eval()
-    plain = ElectrodeVAE(19).eval()
-    error = lambda n: ((n(x)[0] - x).square().mean() / x.square().mean()).item()  # noqa: E731
-    assert error(net) < 0.1 < error(plain)
-    with pytest.raises(ValueError, match="needs that shape"):
-        ElectrodeVAE(19, linear=axes[:5])
 
 
 def test_pod_is_the_truncated_singular_value_decomposition():

@@ -146,7 +146,7 @@ def test_verb_prints_a_table(tmp_path, capsys, monkeypatch):
         == 0
     )
     text = capsys.readouterr().out
-    assert "electrode_code" in text and "drift_aware" in text
+    assert "electrode_vae" in text and "drift_aware" in text
     assert set(json.loads((tmp_path / "o.json").read_text())["reconstruction"]["models"]) >= {
         "pca8",
         "electrode_vae",
@@ -197,7 +197,7 @@ def test_bad_files_are_named(tmp_path, capsys):
 def test_real_press_beats_the_bars(tmp_path):
     result = evaluated(PRESS / "SynImpF1.txt", PRESS / "ForceData.txt", tmp_path / "r.json")
     models = result["reconstruction"]["models"]
-    assert models["electrode_vae"]["test"]["rms"] < 14.1 and models["electrode_code"]["test"]["rms"] < 10
+    assert models["electrode_vae"]["test"]["rms"] < 14.1
     assert (
         np.array(result["force_regression"]["models"]["drift_aware"]["rmse"]) < [0.235, 0.406, 0.340]
     ).all()

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...files import save_figure, write_json
 from ...recordings.recording import Recording
-from ...sensor.channels import FULL_SCALE, log_impedance
+from ...sensor.channels import FULL_SCALE
 from ..protocol import check_changes, is_better, quartiles
 from .examples import blocks
 from .force import TRIALS, fit_force
@@ -35,8 +35,8 @@ def evaluate_recording(
     Args:
       recording: without force only the reconstruction is evaluated.
       fraction: of the rows, in time, for training; everything is fitted on them only.
-      seed: of the networks.
-      network: False: PCA in place of networks (seconds, for tests).
+      seed: of the network.
+      network: False: PCA in place of the network (seconds, for tests).
 
     Returns:
       the written content.
@@ -60,7 +60,7 @@ def evaluate_recording(
         if saturation > 0.001
     ]
     steps = int(np.clip(_EPOCHS * ntrain // _BATCH, *_STEPS)) if network else 0
-    with tqdm(total=2 * steps, desc="evaluate: codes", disable=not progress or None, leave=False) as bar:
+    with tqdm(total=steps, desc="evaluate: code", disable=not progress or None, leave=False) as bar:
         reconstruction, traces = _reconstruction(counts, ntrain, seed, steps, bar)
     result = {
         "schema": "biotac_mj.learning.recording/4",
@@ -131,8 +131,7 @@ def _reconstruction(counts, ntrain, seed, steps, bar):
     code = (counts - mean) @ axes[:, :_CODE]
     rows = {"predict_mean": np.broadcast_to(mean, counts.shape), "pca8": code @ axes[:, :_CODE].T + mean}
     if steps:
-        for name, vae in (("electrode_vae", True), ("electrode_code", False)):
-            rows[name] = np.clip(_through_code(counts, ntrain, vae, seed, steps, bar), 0, FULL_SCALE)
+        rows["electrode_vae"] = np.clip(_through_code(counts, ntrain, seed, steps, bar), 0, FULL_SCALE)
     table = {
         name: {"train": _rms((y - counts)[:ntrain]), "test": _rms((y - counts)[ntrain:])}
         for name, y in rows.items()
@@ -153,47 +152,27 @@ def _reconstruction(counts, ntrain, seed, steps, bar):
     }, rows[best]
 
 
-def _through_code(counts, ntrain, vae, seed, steps, bar):
-    """(n, nelectrode) counts through a code of 8; the network is trained on the first ntrain rows for so many
-    steps.
-
-    vae: the paper's, on counts. Otherwise an autoencoder without sampling on ln Z, in which warm-up is a
-    straight line, initialised as principal components; its loss is on counts."""
+def _through_code(counts, ntrain, seed, steps, bar):
+    """(n, nelectrode) counts through a code of 8 of the paper's network, trained on the first ntrain rows for
+    so many steps."""
     import torch
 
     from ..networks.electrode_vae import ElectrodeVAE
     from ..training.fitting import Checkpoints, TrainingOptions, train
 
     torch.manual_seed(seed)
-    size = counts[:ntrain].std()  # one scale for all channels: errors weigh equally
+    size, mean = counts[:ntrain].std(), counts[:ntrain].mean(0)  # one scale for all channels
     steep = -counts * (1 - counts / FULL_SCALE) / size  # change of counts with a common change of ln Z
-    tensor = lambda value: torch.tensor(value, dtype=torch.float32)  # noqa: E731
-    if vae:
-        net, x, common = (
-            ElectrodeVAE(counts.shape[1]),
-            tensor((counts - counts[:ntrain].mean(0)) / size),
-            tensor(steep),
-        )
-        read = lambda y: y  # noqa: E731
-    else:
-        log_z, slope = log_impedance(counts), steep[:ntrain].mean(0)
-        mean = log_z[:ntrain].mean(0)
-        rows = (log_z - mean) * slope
-        axes = principal_components(rows[:ntrain])[1][:, :_CODE]
-        net, x = ElectrodeVAE(counts.shape[1], linear=tensor(axes.T)), tensor(rows)
-        common, mean, slope = tensor(np.broadcast_to(slope, rows.shape).copy()), tensor(mean), tensor(slope)
-        read = lambda y: FULL_SCALE / size / (1 + torch.exp(mean + y / slope))  # noqa: E731
+    x, common = (torch.tensor(value, dtype=torch.float32) for value in ((counts - mean) / size, steep))
+    net = ElectrodeVAE(counts.shape[1])
 
     def loss(row):
-        y = x[row] + _GAIN * torch.randn(len(row), 1) * common[row]
-        if vae:
-            return net.loss(y, _KL)
-        return ((read(net.decode(net.encode(y)[0])) - read(y)) ** 2).sum(1).mean()
+        return net.loss(x[row] + _GAIN * torch.randn(len(row), 1) * common[row], _KL)
 
     options = TrainingOptions(_BATCH, steps, 1e-3, seed=seed)
     train(net, loss, torch.arange(ntrain), options, checkpoints=Checkpoints(report=bar.update))
     with torch.no_grad():
-        return read(net(x)[0]).numpy() * size + (counts[:ntrain].mean(0) if vae else 0.0)
+        return net(x)[0].numpy() * size + mean
 
 
 def _force(counts, force, ntrain, bar):

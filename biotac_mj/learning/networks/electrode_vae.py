@@ -1,5 +1,4 @@
-"""The electrode VAE of Narang et al. (ICRA 2021), 19-256-128-64-8 and mirrored for a BioTac, and a variant
-initialised with principal components."""
+"""The electrode VAE of Narang et al. (ICRA 2021), 19-256-128-64-8 and mirrored for a BioTac."""
 
 from collections.abc import Sequence
 
@@ -27,43 +26,19 @@ class ElectrodeVAE(VAE):
 
     Args:
       nelectrode: electrodes. hidden: widths of the encoder. latent: size of the code.
-      linear: for the variant: (latent, nelectrode) orthonormal rows, principal components of the inputs. Code
-        and decoder are then the components plus a correction by the network, so training starts near PCA's
-        error. None: the paper's network.
     """
 
-    def __init__(
-        self,
-        nelectrode: int,
-        hidden: Sequence[int] = (256, 128, 64),
-        latent: int = 8,
-        linear: torch.Tensor | None = None,
-    ):
+    def __init__(self, nelectrode: int, hidden: Sequence[int] = (256, 128, 64), latent: int = 8):
         super().__init__()
         self.latent = latent
         self.encoder = mlp([nelectrode, *hidden, 2 * latent])
         self.decoder = mlp([latent, *hidden[::-1], nelectrode])
-        self.skip_in = self.skip_out = None
-        if linear is not None:
-            if tuple(linear.shape) != (latent, nelectrode):
-                raise ValueError(
-                    f"linear has shape {tuple(linear.shape)}: "
-                    f"the code of {latent} from {nelectrode} channels needs that shape"
-                )
-            self.skip_in = nn.Linear(nelectrode, latent, bias=False)
-            self.skip_out = nn.Linear(latent, nelectrode, bias=False)
-            with torch.no_grad():
-                self.skip_in.weight.copy_(linear), self.skip_out.weight.copy_(linear.T)
-                for last in (self.encoder[-1], self.decoder[-1]):
-                    last.weight.mul_(0.1), last.bias.zero_()
 
     def encode(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and log variance of the code, (n, latent) each, of x (n, nelectrode)."""
         mean, log_variance = self.encoder(x).chunk(2, -1)
-        if self.skip_in is not None:
-            mean = mean + self.skip_in(x)
         return mean, log_variance.clamp(-14, 4)
 
     def decode(self, z: torch.Tensor) -> torch.Tensor:
         """(n, nelectrode) of codes z (n, latent)."""
-        return self.decoder(z) if self.skip_out is None else self.decoder(z) + self.skip_out(z)
+        return self.decoder(z)
