@@ -47,8 +47,8 @@ class ResimulateOptions:
       object_pose: of a stationary object without recorded pose.
       rate: [Hz] of the used rows, at most; rows are not interpolated.
       block: [s] of a touch with fitted poses.
-      skin, material, element, liquid, options: of the simulated sensor, as in `biotac press`; skin None: the
-        default of the recording's design.
+      skin, material, options: of the simulated sensor, as in `biotac press`; skin None: the default of the
+        recording's design.
       batch: touches per batch on a GPU; a shard holds one batch.
       seed: of the split and of the simulated noise. device: of Warp.
     """
@@ -61,8 +61,6 @@ class ResimulateOptions:
     block: float = 5.0
     skin: str | None = None
     material: str | dict = "default"
-    element: str | None = None
-    liquid: bool | None = None
     options: str | dict | None = None
     batch: int = 8
     seed: int = 0
@@ -127,9 +125,7 @@ def resimulate(
     geometry = load_skin(options.skin)
     if recording.electrodes is not None:
         check_nelectrode(geometry.design, recording.electrodes.shape[1], recording.name)
-    rubber, skin, modulus = read_settings(
-        options.material, options.options, element=options.element, liquid=options.liquid
-    )
+    rubber, skin, modulus = read_settings(options.material, options.options)
     name = PLATE if options.poses == "fitted" else _object(recording, options.object)
     make_object(name)
     here = options.device if ray is None else "cpu"

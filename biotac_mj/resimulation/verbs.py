@@ -39,8 +39,6 @@ def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Arg
     )
     v.add_argument("--skin", help="mesh of the skin (default: the default of the recording's design)")
     v.add_argument("--material", default="default", help="preset, .json file or JSON of the rubber")
-    text = "liquid under the skin (default: the material's)"
-    v.add_argument("--liquid", action=argparse.BooleanOptionalAction, default=None, help=text)
     v.add_argument("--options", metavar="JSON", help="further settings of the skin (docs/features.md)")
     v.add_argument("--batch", type=whole(1, 10_000), default=8, help="touches in a shard, parallel on a GPU")
     v.add_argument("--workers", type=whole(0, 1024), help="processes for the readings (default: one a core)")
@@ -62,7 +60,7 @@ def _resimulate(args):
     recording, notes = load_one(
         args.recording, args.which, force=args.force, rate=args.rate, scale=args.scale
     )
-    same = "object poses block skin material liquid options batch seed device".split()
+    same = "object poses block skin material options batch seed device".split()
     settings = {name: getattr(args, name) for name in same}
     poses = {name: tuple(value) for name in ("mount", "object_pose") if (value := getattr(args, name))}
     options = ResimulateOptions(rate=args.at_most, **settings, **poses)
