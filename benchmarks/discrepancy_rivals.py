@@ -70,7 +70,7 @@ def _library(comparison, null, chosen):
     """[(effect, shape, block (rows, free))] of the usable catalogue, and y (rows,), both without nuisance."""
     from biotac_mj.effects.catalogue import CATALOGUE
 
-    base = null.vectors(comparison)
+    base = comparison.vectors(null.effects, null.nuisance)
     q = nuisance_space(comparison, null, base, chosen)
     y = stacked(comparison, base, chosen)
     y, out = y - q @ (q.T @ y), []

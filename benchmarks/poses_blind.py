@@ -150,12 +150,13 @@ def shown(measured, clean, sim):
 
     every = np.arange(len(measured))
     comparison = about_rests(sim, measured, sim.fields(measured, progress=False), REPEATABILITY)
-    comparison = comparison.calibrated(fit_effects(comparison, [], every).nuisance)
+    modulus = fit_effects(comparison, [], every).nuisance.modulus
+    comparison = dataclasses.replace(comparison, modulus=modulus)
     fit = fit_effects(comparison, [], every)
     free = dataclasses.replace(comparison, trajectories=clean).measured  # about rests of their own
     hidden = [comparison.vector(i, m - c) for i, (m, c) in enumerate(zip(comparison.measured, free))]
     y = stacked(comparison, hidden, every)
-    q = nuisance_space(comparison, fit, fit.vectors(comparison), every)
+    q = nuisance_space(comparison, fit, comparison.vectors(fit.effects, fit.nuisance), every)
     edges, rows = np.cumsum([0, *(v.size for v in hidden)]), [len(t.time) for t in measured]
 
     def nats(y):

@@ -66,12 +66,9 @@ class Fit:
         raw = comparison.raw(self.effects, self.nuisance, offsets=self.offsets)
         return [r / s for r, s in zip(raw, comparison.sigmas)]
 
-    def vectors(self, comparison: "Comparison") -> list:
-        return comparison.vectors(self.effects, self.nuisance)
-
     def mean_square(self, comparison: "Comparison") -> np.ndarray:
         """(trajectories,) mean square of rows, and of the pose's error, by noise and resolution."""
-        return np.array([v @ v for v in self.vectors(comparison)])
+        return np.array([v @ v for v in comparison.vectors(self.effects, self.nuisance)])
 
     def raw(self, comparison: "Comparison", exact: bool | list = False) -> list:
         return comparison.raw(self.effects, self.nuisance, exact)

@@ -27,7 +27,7 @@ class Comparison:
     not attributed to an effect, and an offset that all trials share is evidence. Electrodes are compared
     relative to their rest: the mean over all trajectories of row 0.
 
-    modulus: of the base model as calibrated, a factor; J_i and S_b follow it (`calibrated`).
+    modulus: of the base model as calibrated, a factor; J_i and S_b follow it.
     about: (trajectories, 3) errors of poses [m] at which J_i is taken; None: at the recorded poses (`posed`).
     noises: (width,) of the channels alone; sigma, sigmas: with the model's resolution, of all trajectories
     and of each.
@@ -59,10 +59,19 @@ class Comparison:
             for t in self.trajectories
         ]
         self.noises, self.likelihoods = np.concatenate([self.noise[name] for name in self.groups]), {}
-        # One deep press decides nothing of what the light ones can show.
-        self.sigmas = np.array([np.hypot(self.noises, self._floor(m)) for m in self.measured])
+        # One deep press decides nothing of what the light ones can show; but relative sizes of electrodes are
+        # not better known where a touch is light.
+        floor = np.array([np.abs(m).max(0) for m in self.measured])
+        floor[:, : self.nelectrode] = floor[:, : self.nelectrode].max(0)
+        for s in self.groups.values():
+            floor[:, s] = SETTINGS.resolution * floor[:, s].mean(1, keepdims=True)
+        self.sigmas = np.hypot(self.noises, floor)
         self.sigma = np.sqrt((self.sigmas**2).mean(0))
-        self._prepare()
+        self._basis = []  # of each trajectory, orthonormal u of its whitened pose columns, u s v' = J
+        for i in range(len(self.trajectories)):
+            columns = self.moved(i, 0.0 if self.about is None else self.about[i])
+            J = np.stack([(c * self.repeatability / self.sigmas[i]).ravel() for c in columns], axis=1)
+            self._basis.append(np.linalg.svd(J, full_matrices=False))
 
     @property
     def channels(self) -> list[str]:
@@ -70,28 +79,10 @@ class Comparison:
         more = (["pdc"] if self.has_pdc else []) + (["Fx", "Fy", "Fz"] if self.has_force else [])
         return electrode_names(range(self.nelectrode)) + more
 
-    def _floor(self, measured):
-        """Expected error (width,) of the base model in a trajectory (n, width): for electrodes by the largest
-        of all, since their relative sizes are not better known where a touch is light."""
-        own = np.abs(measured).max(0)
-        every = np.max([np.abs(m).max(0) for m in self.measured], axis=0)
-        largest = np.where(np.arange(self.width) < self.nelectrode, every, own)
-        return np.concatenate(
-            [np.full(s.stop - s.start, SETTINGS.resolution * largest[s].mean()) for s in self.groups.values()]
-        )
-
     def _stack(self, electrodes, pdc, force):
         return np.column_stack(
             [electrodes, *([pdc] if self.has_pdc else []), *([force] if self.has_force else [])]
         )
-
-    def _prepare(self):
-        """Computes, for every trajectory, an orthonormal basis u of its whitened pose columns, u s v' = J."""
-        self._basis = []
-        for i in range(len(self.trajectories)):
-            at = 0.0 if self.about is None else self.about[i]
-            J = np.stack([(c / self.sigmas[i]).ravel() for c in self.moved(i, at)], axis=1)
-            self._basis.append(np.linalg.svd(J * self.repeatability, full_matrices=False))
 
     def moved(self, i: int, offset: np.ndarray | float = 0.0) -> list[np.ndarray]:
         """Derivative of trajectory i by its pose, (n, width) per metre along x, y and z, about an offset (3,)
@@ -120,10 +111,6 @@ class Comparison:
     def astray(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(3,) errors of the trial's pose, of unit variance by noise and repeatability together."""
         return self._split(i, residual)[0] / np.sqrt(1 + self._basis[i][1] ** 2)
-
-    def calibrated(self, nuisance: Nuisance) -> "Comparison":
-        """The same about a base model whose modulus was fitted."""
-        return dataclasses.replace(self, modulus=nuisance.modulus)
 
     def poses(self, effects: list, nuisance: Nuisance = KNOWN) -> np.ndarray:
         """(trajectories, 3) most probable error of every trial's pose [m], in the BioTac's frame."""

@@ -147,7 +147,7 @@ def diagnose(
         if exchange is not None:
             comparison = about_rests(sim, data, fields, repeatability, exchange.reads)
             first = fit_effects(comparison, [], chosen, first)
-        comparison = comparison.calibrated(first.nuisance)
+        comparison = dataclasses.replace(comparison, modulus=first.nuisance.modulus)
         bar.update()
         null = fit_effects(comparison, [], chosen)
         search = found(comparison, null, usable, chosen, bar)

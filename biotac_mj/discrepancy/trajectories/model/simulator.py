@@ -121,7 +121,8 @@ class Simulator(Solver):
         ordered = sorted(effects, key=lambda item: list(STAGES).index(item[0].stage))
         before = [(e, th) for e, th in ordered if e.before_skin]
         after = [(e, th) for e, th in ordered if (e, th) not in before]
-        session, runs = {}, []
+        session, runs, design = {}, [], self.design
+        late = nuisance.late(design)
         for i, begun in enumerate(fields.begun):
             run = copy.copy(begun)
             run.session, run.modulus, run.log_friction = session, modulus, nuisance.log_friction
@@ -144,7 +145,7 @@ class Simulator(Solver):
             if np.ndim(between):
                 run.add(between)
             if nuisance.footprint:
-                run.log_z = widen(run.log_z, run.rest_log_z, nuisance.footprint, self.design)
+                run.log_z = widen(run.log_z, run.rest_log_z, nuisance.footprint, design)
         for run in runs:
             for stage in ("K", "C", "T"):
                 for effect, theta in after:
@@ -155,8 +156,8 @@ class Simulator(Solver):
                 run.force = run.force - np.cross(run.turn, run.force)
             log_z = run.log_z - nuisance.stands_off * self.log_rest if nuisance.stands_off else run.log_z
             run.counts = 4095 / (np.exp(log_z) / 1e4 + 1)
-            if nuisance.age:
-                run.counts = shifted(run.counts, run.time, nuisance.late(self.design))
+            if late:
+                run.counts = shifted(run.counts, run.time, late)
             run.pdc = 2000 + run.pressure / 36.5
             for effect, theta in after:
                 if effect.stage == "A":
