@@ -20,6 +20,7 @@ from .rest import Rest, rest
 from .session import Session
 
 _PANELS = 4  # channels, of the report's first figure
+_REPEATED = 0.02  # of the rows: of a bus that is slower than the logger, and no fault
 _CHECKUP = "three minutes of touches that isolate one effect each tell what a plain log mixes"
 _ORDER = "rest levels unlike those of published sensors: an order of channels that is wrong all the time"
 
@@ -85,6 +86,8 @@ def concluded(
     r, left, found = session.recording, rest(session), [*session.ordered, *late]
     seconds = len(r) / r.rate
     data = f"read as {r.design.title}, {len(r)} rows, {seconds:.0f} s at {r.rate:.1f} Hz ({r.rate_source})"
+    if (repeated := r.repeated.mean()) > _REPEATED:
+        data += f", of which {repeated:.0%} repeat the one before"
     data += ", with force" if r.force is not None else ""
     further = experiments([_finding(f) for f in session.ordered])
     return RecordingDiagnosis(
