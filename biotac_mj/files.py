@@ -6,6 +6,7 @@ import io
 import json
 import os
 import pathlib
+import shlex
 import shutil
 import stat
 import tempfile
@@ -22,6 +23,11 @@ if typing.TYPE_CHECKING:
 
 _MARK = ".biotac-"  # start of the names of temporary files
 _ROOM = 32  # characters that the name of a temporary file needs beyond the suffix
+
+
+def quoted(path: pathlib.Path | str) -> str:
+    """A path as the shell takes it, in a command that is printed."""
+    return shlex.quote(str(path))
 
 
 @contextlib.contextmanager

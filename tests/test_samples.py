@@ -1,5 +1,8 @@
 """`biotac data samples`: synthetic files in the forms that diagnose and train read, touched and not."""
 
+import pathlib
+import re
+import shlex
 import subprocess
 import sys
 
@@ -35,6 +38,21 @@ def test_samples_are_what_the_verbs_read(tmp_path, capsys):
     assert logged.object_pos.shape == (len(logged), 3) and np.ptp(logged.object_pos, axis=0).min() > 1e-3
     with TactileSet(folder / "set") as made:
         assert len(made) == samples.TOUCHES == 50 and made.labelled.all() and made["converged"][:].all()
+
+
+def test_commands_that_verbs_print_run_as_they_stand(tmp_path, capsys):
+    """In a folder with a space too: those of samples, of an import and of a checkup."""
+    folder = tmp_path / "my samples"
+    assert cli.main(["data", "samples", str(folder), "--quiet"]) == 0
+    log, protocol = str(folder / "my log.h5"), str(folder / "my protocol.yaml")
+    assert cli.main(["recording", "import", str(folder / "log.csv"), "--out", log]) == 0
+    assert cli.main(["checkup", "--out", protocol]) == 0
+    printed = re.findall(r"\bbiotac ((?:diagnose|learn|recording) [^`\n]*)", capsys.readouterr().out)
+    words = [shlex.split(line, comments=True) for line in printed]
+    for line in words:
+        cli.parser().parse_args(line)
+    paths = [word for line in words for word in line if word.startswith(str(tmp_path))]
+    assert len(words) == 6 and len(paths) == 8 and all(pathlib.Path(path).exists() for path in paths)
 
 
 @pytest.mark.parametrize("rows", [slice(None), slice(6000)])

@@ -3,7 +3,7 @@
 import argparse
 
 from ..arguments import SEED, check_device, output_file, output_folder, quantity, real, whole
-from ..files import check_output_file, refuse_inputs
+from ..files import check_output_file, quoted, refuse_inputs
 from ..reading import reading
 from .common import add_results, add_sensor, add_skin, add_verb
 from .names import INDENTER_HELP, LOCATION_HELP, TASKS
@@ -128,7 +128,7 @@ def add_samples(verbs: argparse._SubParsersAction) -> None:
 def _samples(args):
     from ..samples import OBJECT, make_samples
 
-    electrodes, forces, log, made = make_samples(args.out, args.seed, not args.quiet)
+    electrodes, forces, log, made = map(quoted, make_samples(args.out, args.seed, not args.quiet))
     print("synthetic, made by the simulation. Next:")
     print(f"  biotac diagnose --electrodes {electrodes} --force {forces}")
     print(f"  biotac diagnose {log} --object {OBJECT}  # a minute or two: the skin is solved again and again")
@@ -312,7 +312,7 @@ def _import_mesh(args):
         print(f"  {'box ' + axis:<56}{a:>10.3f} .. {b:.3f} mm")
     print(f"  {'gap of the electrodes to the skin':<56}{min(gaps):>10.3f} .. {max(gaps):.3f} mm")
     geometry.save(out)
-    print(f"  stored in {out}: use it with --skin {out}")
+    print(f"  stored in {out}: use it with --skin {quoted(out)}")
 
 
 def add_design(verbs: argparse._SubParsersAction) -> None:

@@ -4,9 +4,10 @@ import argparse
 import dataclasses
 import os
 import pathlib
-import shlex
 import typing
 from collections.abc import Sequence
+
+from ..files import quoted
 
 if typing.TYPE_CHECKING:
     from ..recordings.recording import Recording
@@ -70,7 +71,7 @@ def _reported(verdict: "Verdict", folder: pathlib.Path) -> None:
     from .report.files import write_report
     from .report.text import summary
 
-    command = verdict.next_command.replace("REPORT", shlex.quote(str(folder)))
+    command = verdict.next_command.replace("REPORT", quoted(folder))
     verdict = dataclasses.replace(verdict, next_command=command)
     files = write_report(verdict, folder)
     print(summary(verdict))
@@ -224,7 +225,7 @@ def next_verb(args: argparse.Namespace) -> None:
         print(f"{least[1]:.1f} for {' against '.join(least[0])}; {np.log(ODDS):.0f} are {ODDS:.0f} to 1")
     files = write_plan(plan, args.out)
     print("  " + " ".join(map(str, files)))
-    print(f"then: biotac diagnose MEASURED --earlier {args.report} --out NEXT")
+    print(f"then: biotac diagnose MEASURED --earlier {quoted(args.report)} --out NEXT")
 
 
 def checkup_verb(args: argparse.Namespace) -> None:
@@ -237,8 +238,8 @@ def checkup_verb(args: argparse.Namespace) -> None:
         print(f"{number}. {one.start:.0f} to {one.stop:.0f} s, {one.kind}: {step.line} Tells {step.tells}.")
     write_protocol(args.out, plan)
     print(
-        f"written: {args.out}; next: `biotac recording record --topic NAME --protocol {args.out} --out "
-        "checkup.h5` prompts the steps; or record by other means, and write into it when each was done"
+        f"written: {args.out}; next: `biotac recording record --topic NAME --protocol {quoted(args.out)} "
+        "--out checkup.h5` prompts the steps; or record by other means, and write into it when each was done"
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from ..arguments import SEED, add_ray, device, output_file, output_folder, real, whole
 from ..fields import refuse_unknown
-from ..files import check_output_file
+from ..files import check_output_file, quoted
 from ..reading import read_json
 from ..recordings.verbs import add_load_arguments, add_which
 
@@ -132,7 +132,7 @@ def _train_all(args):
     on = args.source, args.out, args.seeds, args.splits
     how = dict(progress=not args.quiet, ray=args.ray)
     train_all(*on, LearningConfig(**settings), args.device, args.paper, **how)
-    print(f"written: {args.out}; judge it with `biotac learn judge {args.out}`")
+    print(f"written: {args.out}; judge it with `biotac learn judge {quoted(args.out)}`")
 
 
 def _check_device(name):
@@ -276,7 +276,7 @@ def _save_reader(args, reader, scores):
     _note_useless(reader.meta)
     useless = reader.meta["useless"]
     good = ", ".join(n for target in scores["targets"] for n in TARGETS[target] if n not in useless)
-    use = f"; use {good if useless else 'it'} with `biotac learn predict {args.out} RECORDING`"
+    use = f"; use {good if useless else 'it'} with `biotac learn predict {quoted(args.out)} RECORDING`"
     print(f"written: {args.out}{use if good else ''}")
 
 

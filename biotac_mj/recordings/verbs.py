@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable
 
 from ..arguments import output_file, output_folder, quantity, real, whole
-from ..files import refuse_existing
+from ..files import quoted, refuse_existing
 
 _FORMS = ("biotac_sensors", "tactile_msgs")
 
@@ -107,7 +107,7 @@ def _written(path, recordings):
     write(path, recordings)
     for one in recordings:
         print(f"{one.name}: " + "\n  ".join(findings(one)))
-    print(f"written: {path}; see it with `biotac recording show {path}`")
+    print(f"written: {path}; see it with `biotac recording show {quoted(path)}`")
 
 
 def _export(args):
@@ -140,7 +140,7 @@ def _record(args):
     recordings = _prompted(args, timeline) if timeline else _recorded(args, args.seconds or 10.0)
     _written(args.out, recordings)
     if timeline:
-        print(f"written: {timeline}; next: biotac diagnose {args.out} --protocol {timeline}")
+        print(f"written: {timeline}; next: biotac diagnose {quoted(args.out)} --protocol {quoted(timeline)}")
 
 
 def _recorded(args, seconds):

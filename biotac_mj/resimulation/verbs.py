@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Callable
 
 from ..arguments import SEED, add_ray, check_device, device, output_folder, real, whole
+from ..files import quoted
 from ..recordings.verbs import add_load_arguments, add_which
 
 _TEXT = "X Y Z [m], then QW QX QY QZ where it is turned"
@@ -74,4 +75,4 @@ def _resimulate(args):
         print(f"simulated and measured force differ by {report.force_rms:.2f} N RMS")
     for note in [*notes, *report.notes]:
         print(f"  note: {note}")
-    print(f"written: {args.out}; next `biotac learn train {args.out}`")
+    print(f"written: {args.out}; next `biotac learn train {quoted(args.out)}`")
