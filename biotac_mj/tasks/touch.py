@@ -64,7 +64,7 @@ class Touch:
         return self._value.copy()
 
 
-def features(touch):
+def features(touch: np.ndarray) -> np.ndarray:
     """(n, 251) features of (n, 20): the touch, and constant, linear and quadratic terms of its normalised
     shape."""
     shape = 10 * touch / (np.abs(touch).sum(axis=1, keepdims=True) + 1.0)
