@@ -10,6 +10,8 @@ import warp as wp
 # a fifth less time to compile, and all but the elements' run as fast
 _LIMITS = "-mllvm=-inline-", "-mllvm=-slp-"
 _WARP = wp.config.cpu_compiler_flags  # kernels that are made later have the same
+# PTX, which Warp makes by default, is compiled by the driver, one module at a time
+wp.config.cuda_output = wp.config.cuda_output or "cubin"
 
 
 def kernel_module(name: str, inlined: bool = False) -> str:

@@ -13,6 +13,7 @@ from biotac_mj import batch
 from biotac_mj.batch import ahead
 from biotac_mj.batch.ahead import _noted, kernels_of_step, launched_by
 from biotac_mj.batch.hook import Hook
+from biotac_mj.batch.implicit import integrator
 from biotac_mj.skin.program import Fork
 
 SCENE = """<mujoco><asset><mesh name="tet" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset><worldbody>
@@ -130,7 +131,8 @@ def test_all_launches_of_a_batch_step_are_found_data_unchanged():
             skins.reset()
             mjw.reset_data(m, d)
             mjw.step(m, d)
-    assert found == needed
+    # the ball is held by nothing else: of both sides of a branch this step needs no correction
+    assert needed <= found and found - needed <= {integrator.step.module}
     assert any("condensed.solve" in module.name for module in found)
     assert skins.began.numpy().all() and (np.abs(skins.wrench).max((1, 2)) > 1e-3).all()
 

@@ -41,7 +41,7 @@ def block_memory() -> wp.uint64:
 _OF_BLOCK = """
 #if defined(__CUDA_ARCH__)
     const int count = sizeof(own) / sizeof(double), warps = (blockDim.x + 31) / 32;
-    __shared__ double part[32][count];
+    __shared__ double part[16][count];
     double* number = (double*)&own;
     for (int i = 0; i < count; ++i)
         for (int far = 16; far > 0; far /= 2) number[i] += __shfl_down_sync(0xffffffffu, number[i], far);
@@ -60,7 +60,7 @@ _OF_BLOCK = """
 
 @wp.func_native(_OF_BLOCK)
 def block_sum(own: real) -> real:
-    """Sum of a number or vector over the threads of a block of whole warps, in a fixed order. All threads
+    """Sum of a number or vector over the threads of a block, at most 16 whole warps, in a fixed order. All
     must take part, and get it. On the CPU a block has one thread."""
     ...
 
@@ -110,7 +110,7 @@ def sum_of_lanes(p: wp.vec3, lanes: int) -> wp.vec3: ...  # noqa: F811
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    __shared__ double part[32];
+    __shared__ double part[16];
     const int warps = blockDim.x / 32;
     for (int far = 16; far > 0; far /= 2) own = fmax(own, __shfl_xor_sync(0xffffffffu, own, far));
     __syncthreads();
@@ -129,7 +129,7 @@ def block_max(own: real) -> real:
 @wp.func_native("""
     int before = 0, total = own;
 #if defined(__CUDA_ARCH__)
-    __shared__ int part[32];
+    __shared__ int part[16];
     const int lane = threadIdx.x % 32, warp = threadIdx.x / 32, warps = blockDim.x / 32;
     int sum = own;
     for (int near = 1; near < 32; near *= 2) {
