@@ -21,7 +21,7 @@ from biotac_mj.view import find_gl
 REPO = pathlib.Path(__file__).resolve().parents[1]
 PAGES = [REPO / "README.md", REPO / "CONTRIBUTING.md", *sorted((REPO / "docs").rglob("*.md"))]
 PAGES = [page for page in PAGES if page.name != "api.md" and "_build" not in page.parts]
-NEEDS = {"ros.md": "rosbags", "recordings.md": "rosbags", "isaaclab.md": "mujoco_warp"}
+NEEDS = dict.fromkeys(("ros.md", "recordings.md", "export.md"), "rosbags") | {"isaaclab.md": "mujoco_warp"}
 NEIGHBOURS = {"mjlab.md": "mjlab", "mjx.md": "jax"}  # and JAX of gradients.md: `make test-neighbours`
 FENCE = re.compile(r"^ *```.*?^ *```$", re.M | re.S)
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")).resolve() / "shadow_hand"
