@@ -10,10 +10,9 @@ mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install 
 import warp as wp
 from test_batch import RADIUS, ball_spec, make, move, places, press, press_spec, read, shell
 
-from biotac_mj.batch.clearance import Clearance
 from biotac_mj.batch.rest import Rest
-from biotac_mj.coupling.steppers.fem import CLEAR
 from biotac_mj.skin import newton
+from biotac_mj.skin.contact.clearance import CLEAR, Clearance
 
 CHANNELS = ("contact_force", "electrodes", "pdc", "status")
 

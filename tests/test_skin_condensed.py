@@ -29,7 +29,8 @@ from biotac_mj.skin.condensed import CondensedSkin, Memory
 from biotac_mj.skin.condensed.compliance import SurfaceCompliance
 from biotac_mj.skin.condensed.correction import correction
 from biotac_mj.skin.condensed.rest_tangent import rest_tangent
-from biotac_mj.skin.contact.faces import face_samples
+from biotac_mj.skin.contact.clearance import BOUND, EXACT, TOUCH
+from biotac_mj.skin.contact.faces import empty_laws, face_samples
 from biotac_mj.skin.contact.proximity import ProximityQuery
 from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.state import SavedState
@@ -408,7 +409,7 @@ def test_what_is_clear_of_the_skin(coarse):
     skin = CondensedSkin(coarse, sphere())
     start, direction = touch(coarse.geometry)
     for away in (5e-4, 9e-4, 1.2e-3, 1e-2, 5e-4):
-        assert skin.proximity.clear((start - away * direction)[None], EYE, 1e-3) == (away > 1e-3)
+        assert skin.proximity.clear((start - away * direction)[None], EYE, EXACT) == (away > 1e-3)
 
 
 # --- a function of its arguments
@@ -580,7 +581,7 @@ def test_balls_fall_on_skins_that_share_a_solver():
     top, _ = surface_point(geometry, -10e-3, 0.0)
     quat = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
     forces = []
-    for clear in (1e-3, 1e3):  # the second: always sought
+    for left_alone in (True, False):  # the second: always sought
         spec = mujoco.MjSpec()
         spec.option.timestep, spec.option.integrator = 2e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         handles = []
@@ -596,7 +597,8 @@ def test_balls_fall_on_skins_that_share_a_solver():
             settings = dict(skin="coarse", geoms=["ball0", "ball1"], tier="condensed", readings="none")
             handles.append(biotac_mj.attach(spec, body=f"finger{i}", prefix=f"b{i}_", quat=quat, **settings))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("biotac_mj.coupling.steppers.fem.CLEAR", clear)
+            if not left_alone:
+                patch.setattr(CondensedStepper, "is_out_of_reach", lambda *_: False)
             model = spec.compile()
             data = mujoco.MjData(model)
             force = []
@@ -881,12 +883,10 @@ def test_whether_a_geom_is_deep_does_not_depend_on_where_it_was(coarse):
         normal = np.cross(corner[1] - corner[0], corner[2] - corner[0])
         normal /= np.linalg.norm(normal)
         geoms = GeomSet(["sphere"], [(5e-5,)], [0.5])
-        old = ProximityQuery(coarse, geoms)
+        old = ProximityQuery(coarse, geoms, empty_laws("cpu"))
         for depth in np.arange(-1e-3, 1.5e-3, 5e-5):
             pos = (corner.mean(0) - depth * normal)[None]
-            other = ProximityQuery(coarse, geoms)
-            for search in (old, other):
-                search.pose(pos, EYE)
+            other = ProximityQuery(coarse, geoms, empty_laws("cpu"))
             found.append(other.deep(pos, EYE))
             assert old.deep(pos, EYE) == found[-1]
     assert {True, False} == set(found)
@@ -938,14 +938,14 @@ def test_the_coupling_says_how_far_a_step_got():
 
 
 def test_what_a_search_has_found_before_changes_nothing(coarse):
-    """Regions and clearances are kept over poses, and geoms that are far from a region left out; along walks
-    with small and large steps, into the core and out, each answer is that of a search that is new."""
+    """Clearances are kept over poses: along walks with small and large steps, into the core and out, each
+    answer is that of a search that is new; a bound says what is near rather than miss it."""
     geoms = GeomSet(["sphere", "box", "sphere"], [(RADIUS,), (2e-3, 3e-3, 4e-3), (1e-3,)], [0.5] * 3)
     start, inward = touch(coarse.geometry)
     rng, found, depths = np.random.default_rng(5), [], []
 
     def new():
-        return ProximityQuery(coarse, geoms)
+        return ProximityQuery(coarse, geoms, empty_laws("cpu"))
 
     old = new()
     pos, mat = start - 5e-3 * inward + rng.normal(scale=3e-3, size=(3, 3)), np.repeat(EYE, 3, 0)
@@ -957,15 +957,13 @@ def test_what_a_search_has_found_before_changes_nothing(coarse):
         if i == 60:
             pos[2] = start  # no longer far
         other = new()
-        for search in (old, other):
-            search.pose(pos, mat)
         depths.append(old.deep(pos, mat))
         assert depths[-1] == other.deep(pos, mat)
-        for reach in (0.0, 1e-4, 1e-3):
-            near = old.faces(reach, pos, mat)
-            assert (near == other.faces(reach, pos, mat)).all()
-            found.append(len(near))
-    assert {True, False} == set(depths) and min(found) == 0 and max(found) > 50
+        bound, *clear = [old.clear(pos, mat, wanted) for wanted in (BOUND, TOUCH, EXACT)]
+        assert clear == [other.clear(pos, mat, wanted) for wanted in (TOUCH, EXACT)]
+        assert clear[1] or not bound
+        found.append(sum(clear))
+    assert {True, False} == set(depths) and {0, 1, 2} == set(found)
 
 
 def test_a_second_solve_begins_where_the_first_has_ended(coarse):
@@ -1049,9 +1047,9 @@ def test_a_skin_that_moves_far_finds_its_new_contacts(coarse):
 
 
 @pytest.mark.parametrize("kind", ["sphere", "box", "mesh", "skin"])
-def test_faces_near_moving_geoms_are_all_found(kind):
-    """By clearances kept from where a geom was, against a query that has nothing kept: none is left out,
-    however the geom has moved since."""
+def test_what_moving_geoms_come_near_is_never_missed(kind):
+    """By clearances kept from where a geom was, against a query that has nothing kept, however the geom has
+    moved since."""
     rng, skin = np.random.default_rng(7), load_skin("coarse")
     model = shared_model(skin, skin_settings(Config()), "cpu")
     vert, face = np.unique(skin.outer_face, return_inverse=True)
@@ -1062,23 +1060,18 @@ def test_faces_near_moving_geoms_are_all_found(kind):
         "mesh": Geom("", "mesh", np.zeros(3), 0.0, 0, 0.0, skin.core_vert, skin.core_face),
         "skin": Geom("", "skin", np.zeros(3), 0.0, 0, 0.0, *of_skin),
     }[kind]
-    count = 0
-    # bounds of meshes may be less than the distance, by a cell's diagonal
-    slack = 0.0 if kind in ("sphere", "box") else 0.9e-3
+    found = []
 
     def query(geoms):
         geoms.set_pose(np.zeros((1, 3)))
-        return ProximityQuery(model, geoms)
+        return ProximityQuery(model, geoms, empty_laws("cpu"))
 
-    kept, other, reach = query(geom_set([shape], skin)), geom_set([shape], skin), 2e-5
+    kept, other = query(geom_set([shape], skin)), geom_set([shape], skin)
     pos, turn = np.array([[-8e-3, -18e-3, 1e-3]]), np.eye(3)[None]
     for i in range(60):
         pos = pos + rng.normal(0, 5e-5, 3) + ([0, 2e-4, 0] if i < 40 else [2e-4, 0, 0])
         turn = rotation(rng.normal(0, 1e-3, (1, 3))) @ turn
         fresh = query(other)
-        for one in (kept, fresh):
-            one.pose(pos, turn)
-        near = fresh.faces(reach - slack, pos, turn)
-        assert np.isin(near, kept.faces(reach, pos, turn)).all()
-        count += len(near)
-    assert count > 20
+        found.append([fresh.clear(pos, turn, wanted) for wanted in (TOUCH, EXACT)])
+        assert found[-1] == [kept.clear(pos, turn, wanted) for wanted in (TOUCH, EXACT)]
+    assert len(np.unique(found, axis=0)) == 3

@@ -31,7 +31,7 @@ from ..sensor.vibration import read_texture
 from ..short_repr import short_repr
 from ..skin import liquid, transfer
 from ..skin.condensed import step as condensed_step
-from ..skin.contact import meshes, outside
+from ..skin.contact import clearance, meshes, outside
 from ..skin.geoms import shapes_of
 from ..skin.newton.worlds import BLOCK
 from ..skin.per_world import make_room
@@ -40,7 +40,7 @@ from ..skin.rubber.material import Material
 from ..skin.settings import Settings as SkinModelSettings
 from ..skin.settings import read_material
 from ..skin.step import kernels_for_cuda
-from . import clearance, kernels, rest
+from . import kernels, rest
 from .ahead import kernels_of_step, launched_by
 from .batch import Batch
 from .hook import Hook

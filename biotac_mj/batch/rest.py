@@ -16,12 +16,12 @@ from ..coupling.implicit.rounds import MarkedWorlds, Marks, Model, mark
 from ..coupling.implicit.rules import PATIENCE
 from ..kernels import add_zeros, kernel_module
 from ..skin.contact.broadphase import contact_range
+from ..skin.contact.clearance import TOUCH, Clearance, Seen, forget, make_seen, margin_of
 from ..skin.contact.faces import Laws
 from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE, Worlds
 from ..skin.state import allocate
 from ..skin.types import mat66, real, vec3, vec4, vec6
-from .clearance import Clearance, Seen, forget, make_seen, margin_of
 
 kernel_module(__name__)
 
@@ -357,7 +357,7 @@ class Rest:
             return
         skin, at = self._skin, self._from_asleep
         laws = skin.data.laws.struct
-        at.find(self._sleep.woken, skin.geoms.struct, laws, skin.x, touch=1)
+        at.find(self._sleep.woken, skin.geoms.struct, laws, skin.x, TOUCH)
         self._launch(mark_touched, [laws, self.awake, at.known, at.found], [taking_part.struct])
 
     def leave(self, taking_part: Marks) -> None:

@@ -117,8 +117,8 @@ _MAKING = """
 """.split()
 _STEPPING = """
     skin.newton.load_path skin.precondition.supernodal sensor.acquisition_kernels skin.contact.faces
-    skin.contact.faces.sum_wrench skin.newton.nodes skin.newton.worlds skin.newton.convergence
-    skin.newton.krylov skin.newton.line_search skin.liquid launches
+    skin.contact.clearance skin.contact.faces.sum_wrench skin.newton.nodes skin.newton.worlds
+    skin.newton.convergence skin.newton.krylov skin.newton.line_search skin.liquid launches
 """.split()
 
 

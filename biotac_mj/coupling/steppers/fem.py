@@ -15,6 +15,7 @@ from ...geometry.solid import close_rim
 from ...geometry.surface import pressure_area
 from ...skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_step, step
 from ...skin.bodies import BodyMotion
+from ...skin.contact.clearance import BOUND, EXACT, TOUCH
 from ...skin.contact.meshes import DistanceGrid
 from ...skin.contact.proximity import ProximityQuery
 from ...skin.model import solved_geometry
@@ -29,9 +30,6 @@ _WORK = 145  # of all solves of a two-way skin's step, see SkinOptions.max_work
 _MORE = 4  # times that at most, for rubber that keeps its volume
 # a third of a lone press's: two-way, the error of single steps is heard as chatter
 _TOLERANCE = 3e-4
-# geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
-# [m]
-CLEAR = 1e-3
 # a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's
 # error
 _RESTS = 1e-8, 1.0
@@ -87,11 +85,6 @@ class FemStepper(SkinStepper):
     @functools.cached_property
     def _geom_set(self):
         return geom_set(self._geoms, self._geometry, device=self._config.device)
-
-    @functools.cached_property
-    def _reach(self):
-        """Distance at which geoms act on the skin, by adhesion [m]."""
-        return 0.0 if self._options.contact_law is None else float(self._data.laws.range.max())
 
     def _part(self, state, name):
         return self._layout.part(state, name)
@@ -255,7 +248,7 @@ class FemStepper(SkinStepper):
             step(model, d, geoms, dt)
         new = self._arrays.save_row()
         self._part(new, "started")[:] = 1.0
-        if self._came_to_rest(new) if d.converged[0] else self._untouched(state, *released, 0.0):
+        if self._came_to_rest(new) if d.converged[0] else self._untouched(state, *released, TOUCH):
             return self._still(state, *released)
         return SkinResult(
             state=new,
@@ -291,7 +284,7 @@ class FemStepper(SkinStepper):
     def _proximity(self):
         # looked for contact the first time: the step that finds it need not wait for what it takes
         prepare_step(self._model, self._data, self._geom_set)
-        return ProximityQuery(self._model, self._geom_set)
+        return ProximityQuery(self._model, self._geom_set, self._data.laws.struct)
 
     def resting(self, state: np.ndarray) -> bool:
         return bool(self._part(state, "resting")[0])
@@ -305,13 +298,13 @@ class FemStepper(SkinStepper):
         return (
             self.resting(state)
             and not self._model.device.is_cuda
-            and self._proximity.clear(geom_pos, geom_mat, CLEAR)
+            and self._proximity.clear(geom_pos, geom_mat, BOUND)
         )
 
     def is_clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool | None:
         if self._model.device.is_cuda:
             return None
-        return self._proximity.clear(geom_pos, geom_mat, self._reach)
+        return self._proximity.clear(geom_pos, geom_mat)
 
     @property
     def surface_energy(self) -> float:
@@ -330,17 +323,11 @@ class FemStepper(SkinStepper):
         self._part(state, "geom_mat")[:] = np.ravel(geom_mat)
         self._part(state, "started")[:] = 1.0
 
-    def _untouched(self, state, geom_pos, geom_mat, margin=CLEAR):
-        if (
-            self.inertial
-            or self._material.remembers
-            or self._model.device.is_cuda
-            or not (np.isfinite(geom_pos).all() and np.isfinite(geom_mat).all())
-        ):
+    def _untouched(self, state, geom_pos, geom_mat, wanted=EXACT):
+        if self.inertial or self._material.remembers or self._model.device.is_cuda:
             return False
-        # one that is deformed and let go comes to rest: nearer than this it may bulge to the geoms
-        margin = 0.0 if self.resting(state) else margin
-        return self._proximity.clear(geom_pos, geom_mat, max(margin, self._reach))
+        # one that is deformed and let go comes to rest: nearer than CLEAR it may bulge to the geoms
+        return self._proximity.clear(geom_pos, geom_mat, TOUCH if self.resting(state) else wanted)
 
     def _met_at(self, state, geom_pos, geom_mat):
         """Poses about where geoms on their way to these begin to touch the skin at rest: what they did before
@@ -348,9 +335,9 @@ class FemStepper(SkinStepper):
         if not self._part(state, "started")[0]:
             return self._proximity.outside(geom_pos, geom_mat), geom_mat
         last = self.came_to(state)
-        if _travel(*last, geom_pos, geom_mat) < _SHORT or not self._proximity.clear(*last, self._reach):
+        if _travel(*last, geom_pos, geom_mat) < _SHORT or not self._proximity.clear(*last):
             return last
-        return self._proximity.last_clear(*last, geom_pos, geom_mat, self._reach)
+        return self._proximity.last_clear(*last, geom_pos, geom_mat)
 
     def _came_to_rest(self, state):
         if self.inertial or self._material.remembers or self._part(state, "contacts")[0]:

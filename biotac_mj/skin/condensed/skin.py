@@ -55,8 +55,8 @@ class CondensedSkin:
         self.model, self.geoms, self.linear = model, geoms, LinearSkin.of(model, cache)
         self._first = patience * _EFFORT
         self.rest = model.rest.vert.astype(float)
-        self.proximity = ProximityQuery(model, geoms)
         self._data = SkinData(model, tier=CONDENSED)
+        self.proximity = ProximityQuery(model, geoms, self._data.laws.struct)
         room = Room(MAX_FORCES // 3, MAX_CONTACTS, views=_VIEWS)
         self._step = step = CondensedStep(model, self.linear, self._data, geoms, room, geoms.ngroup)
         tangent = wp.zeros((geoms.ngroup, 1), dtype=wp.spatial_matrixd, device="cpu")
@@ -139,7 +139,6 @@ class CondensedSkin:
             free_pose = tuple(view.copy() for view in self._uncoupled)
         if not memory.started:  # as in the full tier: friction acts from the first touch on
             memory = self.outside(*free_pose)
-            self.proximity.pose(pos, mat)
         if bodies is not None or not self.proximity.deep(pos, mat):
             return self._follow(memory, pos, mat, free_pose, most, near)
         shallow, outside = self.proximity.shallow(pos, mat), self.proximity.outside(pos, mat)
@@ -153,10 +152,10 @@ class CondensedSkin:
         motion, turned = free_pose[0] - memory.geom_pos, np.abs(mat - memory.geom_mat).max(initial=0.0)
         far = np.abs(motion).max(initial=0.0) + _LEVER * turned
         if not len(memory.forces) or far > _FAR:
-            if self.proximity.clear(*free_pose, 0.0):  # the geoms do not touch the skin, or leave it
+            if self.proximity.clear(*free_pose):  # the geoms do not touch the skin, or leave it
                 return self.at_rest(*free_pose)
         out = self._solve(memory, pos, mat, most, near)
-        if not out.converged and self.proximity.clear(*free_pose, 0.0):
+        if not out.converged and self.proximity.clear(*free_pose):
             return dataclasses.replace(self.at_rest(*free_pose), cost=out.cost)
         return out
 

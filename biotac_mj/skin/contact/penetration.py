@@ -1,11 +1,11 @@
 """Penetration checks: geoms in the rigid core, inner faces in the core, start poses of geoms whose path is
-not known, and clearances of the undeformed skin."""
+not known, and clearances of geoms from the core."""
 
 import warp as wp
 
 from ..block import block_max
 from ..types import mat33, real, vec3
-from .broadphase import ALL, geoms_within, has, sample_clearance
+from .broadphase import ALL, has
 from .meshes import DISTANCES, TRILINEAR, grid_value
 from .posed import SKIN, Geoms, LoadPath, bound_to, distance_from, place_on
 from .shapes import distance, rough_bound
@@ -169,31 +169,6 @@ def start_path_outside(
             p = _outside(geoms, g, center, radius, path.pos_end[g, w], R)
             path.pos_start[g, w] = p
             path.mat_start[g, w] = R
-
-
-@wp.kernel(module=DISTANCES)
-def measure_faces(
-    # In:
-    count: wp.array(dtype=int),
-    number: wp.array(dtype=int),
-    face: wp.array(dtype=wp.vec3i),
-    sample: wp.array(dtype=vec3),
-    geoms: Geoms,
-    x: wp.array2d(dtype=vec3),
-    center: vec3,
-    radius: real,
-    reach: wp.array(dtype=real),
-    # Out:
-    clearance_out: wp.array(dtype=real),
-):
-    """Clearances of the faces number[:count[0]], at most reach[0] [m]; below reach[1] any lower bound. The
-    ball around all faces excludes most geoms."""
-    _count, near = geoms_within(center, radius + reach[0], 0, geoms, ALL)
-    for i in range(count[0]):
-        t = face[number[i]]
-        clearance_out[i] = sample_clearance(
-            x[t[0], 0], x[t[1], 0], x[t[2], 0], sample, 0, geoms, near, reach[0], reach[1]
-        )
 
 
 @wp.kernel(module=DISTANCES)

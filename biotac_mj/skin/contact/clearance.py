@@ -1,26 +1,36 @@
-"""Clearances of geoms from the skins of a batch: measured where a geom is near, elsewhere bounded by earlier
+"""Clearances of geoms from undeformed skins: measured where a geom is near, elsewhere bounded by earlier
 ones."""
+
+import typing
 
 import numpy as np
 import warp as wp
 
-from ..coupling.steppers.fem import CLEAR
-from ..geometry.rigid_warp import is_finite
-from ..kernels import add_zeros, kernel_module
-from ..skin.block import block_max
-from ..skin.contact.broadphase import ALL, contact_range, face_clearance, motion_bound, sample_clearance
-from ..skin.contact.faces import Laws
-from ..skin.contact.penetration import geoms_core_clearance
-from ..skin.contact.posed import Geoms, bound_to, place_on
-from ..skin.model import SkinModel
-from ..skin.program import Launcher
-from ..skin.types import mat33, real, vec3
+from ...geometry.rigid_warp import is_finite
+from ...kernels import add_zeros, kernel_module
+from ..block import block_max
+from ..program import Launcher
+from ..types import mat33, real, vec3
+from .broadphase import ALL, contact_range, face_ball, face_clearance, motion_bound, sample_clearance
+from .faces import Laws
+from .penetration import geoms_core_clearance
+from .posed import WINDOW, Geoms, bound_to, place_on
+
+if typing.TYPE_CHECKING:
+    from ..model import SkinModel
 
 kernel_module(__name__)
 
-_CLEAR = wp.constant(wp.float64(CLEAR))
+# geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
+# [m]
+CLEAR = 1e-3
+_CLEAR = wp.constant(real(CLEAR))
+# what is to be found: a clearance that is less than the margin may be a bound; only whether there is contact;
+# every clearance within the margin
+BOUND, TOUCH, EXACT = (wp.constant(i) for i in range(3))
 # by which distances may change faster than places: grids are trilinear
 _ROOT3 = wp.constant(wp.float64(3**0.5))
+_SPREAD = wp.constant(real(1.0 + WINDOW))  # radii of a face by which it is nearer than its centre at most
 
 
 @wp.struct
@@ -79,7 +89,7 @@ def margin_of(laws: Laws, w: int):
 def find_clearance(
     # In:
     skin: Surfaces,
-    touch: int,
+    wanted: int,
     geoms: Geoms,
     laws: Laws,
     on: wp.array(dtype=int),
@@ -91,16 +101,16 @@ def find_clearance(
     known_out: wp.array(dtype=int),
     clearance_out: wp.array(dtype=wp.vec2d),
 ):
-    """Clearance of the geoms from the skin, beyond the margin a bound of it, and from the core: as
-    `ProximityQuery` of one world, in the worlds that are on. It is measured where a geom comes near the ball
-    around the skin, and may be near the skin after its motion since the last time. In others with finite
-    poses it is infinite or, where a geom was near and may still be, a bound.
+    """Clearance of the geoms from the skin, beyond the margin a bound of it, and from the core, in the worlds
+    that are on. It is measured where a geom comes near the ball around the skin, and may be near the skin
+    after its motion since the last time. In others with finite poses it is infinite or, where a geom was near
+    and may still be, a bound.
 
     One block per world: each time its threads have measured a face each, they end if one is touched. They
-    begin with those among which the last touched face was.
+    begin with those among which the last nearest face was: of others the ball is mostly further away.
 
     Args:
-      touch: 1 where only contact matters, not what is near.
+      wanted: BOUND, TOUCH or EXACT.
     """
     w, t = wp.tid()
     known = on[w]
@@ -116,9 +126,9 @@ def find_clearance(
     close *= known
     if close == 1 and seen.clearance.shape[0] > 0:
         bound = _bound(seen, w, skin, geoms)
-        if bound[0] >= wp.where(touch == 1, reach, margin) and bound[1] >= real(0.0):
+        if bound[0] >= wp.where(wanted == TOUCH, reach, margin) and bound[1] >= real(0.0):
             close = 0
-        elif touch == 0 and seen.clearance[w][0] < margin and wp.isfinite(bound[0]):
+        elif wanted == BOUND and seen.clearance[w][0] < margin and wp.isfinite(bound[0]):
             clearance = bound
             close = 0
     if t == 0:
@@ -130,32 +140,39 @@ def find_clearance(
     own = w % x.shape[1]
     parts = (skin.face.shape[0] + threads - 1) / threads
     part = touched[w]
+    closest = part
     nearest = real(wp.inf)
+    p = vec3()
+    around = real(-wp.inf)  # least distance of a geom from p, which bounds that of the faces next to it
     done = int(0)
     while done < parts:
         f = part * threads + t
+        least = nearest
         if f < skin.face.shape[0]:
             i = skin.face[f]
-            least = sample_clearance(
-                x[i[0], own], x[i[1], own], x[i[2], own], skin.sample, w, geoms, ALL, margin, reach
-            )
-            if least >= margin:
-                ball, _beyond, _count, _within = face_clearance(
-                    x[i[0], own], x[i[1], own], x[i[2], own], w, geoms, ALL, margin
-                )
-                least = wp.max(least, ball)
-            nearest = wp.min(nearest, least)
-        nearest = -block_max(-nearest)
-        done += 1
-        if nearest < reach:
-            done = parts
-        else:
-            part = (part + 1) % parts
+            x0 = x[i[0], own]
+            x1 = x[i[1], own]
+            x2 = x[i[2], own]
+            center, radius = face_ball(x0, x1, x2)
+            if around - _ROOT3 * wp.length(center - p) - _SPREAD * radius < nearest:
+                ball, _beyond, _count, _within = face_clearance(x0, x1, x2, w, geoms, ALL, margin)
+                p = center
+                around = ball + radius
+                if ball < nearest:
+                    least = wp.max(
+                        ball, sample_clearance(x0, x1, x2, skin.sample, w, geoms, ALL, nearest, reach)
+                    )
+        least = -block_max(-least)
+        if least < nearest:
+            nearest = least
+            closest = part
+        part = (part + 1) % parts
+        done = wp.where(nearest < reach, parts, done + 1)
     inside = real(wp.inf)
     if nearest >= reach:
         inside = geoms_core_clearance(w, t, threads, geoms, ALL, skin.core, skin.core_vert)
     if t == 0:
-        touched[w] = part
+        touched[w] = closest
         clearance_out[w] = wp.vec2d(nearest, inside)
         if seen.clearance.shape[0] > 0:
             seen.clearance[w] = clearance_out[w]
@@ -173,7 +190,7 @@ def make_seen(ngeom: int, nworld: int) -> Seen:
 
 
 class Clearance:
-    """Distances of geoms from the skins of a batch.
+    """Distances of geoms from skins.
 
     Args:
       seen: `Seen`, what is kept for bounds, of skins that do not change; None: all is measured.
@@ -185,7 +202,7 @@ class Clearance:
         core [m]; infinite where no geom is close. Where the skin is touched it is that of any touch.
     """
 
-    def __init__(self, model: SkinModel, nworld: int, seen: object = None):
+    def __init__(self, model: "SkinModel", nworld: int, seen: object = None):
         self._device, vert = model.device, model.rest.vert
         center = (vert.min(0) + vert.max(0)) / 2
         # wider than any skin at rest is than another of this model: liquids differ by world
@@ -199,9 +216,18 @@ class Clearance:
         if model.has_core:
             self.skin.core_vert, self.skin.core = model.core_vert, model.core(nworld).struct
 
-    def find(self, on: wp.array, geoms: Geoms, laws: Laws, x: wp.array, touch: int = 0) -> None:
+    def find(
+        self,
+        on: wp.array,
+        geoms: Geoms,
+        laws: Laws,
+        x: wp.array,
+        wanted: int = 0,
+        launcher: Launcher | None = None,
+    ) -> None:
         """Finds the clearance in worlds that are on (nworld,), of skins with nodes at (nvert, nworld or 1).
-        Launches only. touch: see `find_clearance`."""
-        known = [self.skin, touch, geoms, laws, on, x]
+        Launches only. wanted: BOUND, TOUCH or EXACT."""
+        known = [self.skin, wanted, geoms, laws, on, x]
         found = [self._touched, self._seen, self.known, self.found]
-        Launcher(self._device).launch_blocks(find_clearance, [len(on)], known, found)
+        launcher = launcher or Launcher(self._device)
+        launcher.launch_blocks(find_clearance, [len(on)], known, found)
