@@ -89,7 +89,7 @@ def test_a_step_in_which_all_rest_solves_nothing(monkeypatch):
 def test_clearances_equal_distances_of_points_from_spheres():
     """Of spheres that touch the skin, are near it, and are far from it, in one world after the other."""
     batch = make(press_spec(), 6, readings=False)[-1]
-    skin, clearance = batch.skin, Clearance(batch.skin.model, 6)
+    skin, clearance = batch.skin, Clearance(batch.skin.model, 1, 6)
     corner = skin.model.rest.vert[skin.model.outer.face.numpy()]
     point = np.einsum("sk,fki->fsi", skin.model.sample.numpy(), corner).reshape(-1, 3)
     clearance.skin.radius, every = 1.0, wp.ones(6, dtype=int)  # [m] none is left out

@@ -149,9 +149,10 @@ def skip_untouched(
     s: Sleep,
     # Out:
     gone_out: wp.array(dtype=bool),
+    met_out: wp.array(dtype=int),
 ):
     """Takes worlds out of the solve whose skin nothing is near to: it comes to rest. One that rests stays so
-    while nothing touches it; another may bulge to what is near."""
+    while nothing touches it; another may bulge to what is near. met: those that rested and are touched."""
     w = wp.tid()
     off = _constants(st, w) - s.own[w]
     if filled == 0:  # rests where it was made, however stiff it is
@@ -165,6 +166,7 @@ def skip_untouched(
         near = NEAR
     s.near[w] = near
     gone_out[w] = near == AFAR or (near == NEAR and s.undeformed[w] == 1)
+    met_out[w] = wp.where(near == TOUCHING, st.wanted[w] * wp.max(s.resting[w], s.undeformed[w]), 0)
     if gone_out[w]:
         st.wanted[w] = 0
 
@@ -322,13 +324,15 @@ class Rest:
             allocate("rest", self, {"world": n})
             self.awake, self.any = wp.ones(n, dtype=int), wp.ones(1, dtype=int)
             self.gone, self.resets = (wp.zeros(n, dtype=bool) for _ in range(2))
-            self._any_reset, self._sleep, st = wp.zeros(1, dtype=int), Sleep(), data.worlds
+            self._any_reset, self._met = wp.zeros(1, dtype=int), wp.zeros(n, dtype=int)
+            self._sleep, st = Sleep(), data.worlds
             s = self._sleep
             add_zeros(s, "woken near at_rest undeformed resting", n)
             s.awake, s.unsettled, s.seen = self.awake, self.unsettled, make_seen(skin.geoms.count, n)
             made = np.stack([a.numpy() for a in (st.mu, st.lam, st.kappa, st.natural)], axis=1)
             s.own, s.constants = (wp.array(made, dtype=vec4) for _ in range(2))
-        self._from_asleep, self.clearance = Clearance(model, n, s.seen), Clearance(model, n)
+        many = skin.geoms.count, n
+        self._from_asleep, self.clearance = Clearance(model, *many, s.seen), Clearance(model, *many)
         self._filled = int(bool(model.options.fill_volume or model.options.rest_pressure or data.rests))
         seen = [s.seen.pos, s.seen.mat, s.seen.clearance]
         self.lasting = [s.resting, s.constants, *seen, s.undeformed]
@@ -383,13 +387,15 @@ class Rest:
     # --- a solve ---
 
     def begin_solve(self) -> None:
-        """Before a solve: takes worlds out of it that nothing is near to. Launches only."""
+        """Before a solve, with geoms where they go without the skin: takes worlds out of it that nothing is
+        near to; in others a skin at rest is first touched where it is met. Launches only."""
         if not self.possible:
             return
         d, laws, at = self._skin.data, self._skin.data.laws.struct, self.clearance
         at.find(d.worlds.wanted, self._skin.geoms.struct, laws, d.rest_vert)
         known = [self._skin.model.options.max_core_depth, self._filled, laws, at.known, at.found]
-        self._launch(skip_untouched, known, [d.worlds, self._sleep, self.gone])
+        self._launch(skip_untouched, known, [d.worlds, self._sleep, self.gone, self._met])
+        at.begin_where_met(self._met, self._skin.geoms.struct, laws, d.rest_vert)
 
     def end_solve(self) -> None:
         """After it: finds `gone` and `resets`. Launches only."""

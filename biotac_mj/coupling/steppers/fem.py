@@ -33,8 +33,6 @@ _TOLERANCE = 3e-4
 # a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's
 # error
 _RESTS = 1e-8, 1.0
-_SHORT = 5e-4  # [m] longest approach to the skin over which friction sees the whole motion, as in batches
-_REACH = 0.02  # [m] from the BioTac's frame to its skin
 _STILL = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)  # a BioTac that does not move
 
 
@@ -334,10 +332,7 @@ class FemStepper(SkinStepper):
         is none of its friction's."""
         if not self._part(state, "started")[0]:
             return self._proximity.outside(geom_pos, geom_mat), geom_mat
-        last = self.came_to(state)
-        if _travel(*last, geom_pos, geom_mat) < _SHORT or not self._proximity.clear(*last):
-            return last
-        return self._proximity.last_clear(*last, geom_pos, geom_mat)
+        return self._proximity.met(*self.came_to(state), geom_pos, geom_mat)
 
     def _came_to_rest(self, state):
         if self.inertial or self._material.remembers or self._part(state, "contacts")[0]:
@@ -369,14 +364,6 @@ class FemStepper(SkinStepper):
         self._arrays.load_row(state)
         self._geom_set.set_pose(*self.came_to(state))
         self._geom_set.advance()
-
-
-def _travel(pos0, mat0, pos, mat):
-    """Displacement of geoms at the skin, from poses (n, 3), (n, 3, 3) to others [m]: the frame of a large one
-    may lie far away, and moves far where it turns a little."""
-    turn = mat @ np.swapaxes(mat0, 1, 2)
-    shift = np.linalg.norm(pos - (turn @ pos0[:, :, None])[:, :, 0], axis=1)
-    return (shift + _REACH * np.linalg.norm(turn - np.eye(3), axis=(1, 2))).max(initial=0.0)
 
 
 def rest_geometry(config: Config, geometry: SkinGeometry) -> SkinGeometry:

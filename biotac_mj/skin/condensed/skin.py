@@ -139,6 +139,10 @@ class CondensedSkin:
             free_pose = tuple(view.copy() for view in self._uncoupled)
         if not memory.started:  # as in the full tier: friction acts from the first touch on
             memory = self.outside(*free_pose)
+        elif not len(memory.forces):
+            pos0, mat0 = self.proximity.met(memory.geom_pos, memory.geom_mat, *free_pose)
+            if (pos0 != memory.geom_pos).any() or (mat0 != memory.geom_mat).any():
+                memory = memory.replace(geom_pos=pos0, geom_mat=mat0)
         if bodies is not None or not self.proximity.deep(pos, mat):
             return self._follow(memory, pos, mat, free_pose, most, near)
         shallow, outside = self.proximity.shallow(pos, mat), self.proximity.outside(pos, mat)

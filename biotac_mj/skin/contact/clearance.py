@@ -6,9 +6,9 @@ import typing
 import numpy as np
 import warp as wp
 
-from ...geometry.rigid_warp import is_finite
+from ...geometry.rigid_warp import is_finite, motion, rotation
 from ...kernels import add_zeros, kernel_module
-from ..block import block_max
+from ..block import block_max, sync
 from ..program import Launcher
 from ..types import mat33, real, vec3
 from .broadphase import ALL, contact_range, face_ball, face_clearance, motion_bound, sample_clearance
@@ -28,6 +28,10 @@ _CLEAR = wp.constant(real(CLEAR))
 # what is to be found: a clearance that is less than the margin may be a bound; only whether there is contact;
 # every clearance within the margin
 BOUND, TOUCH, EXACT = (wp.constant(i) for i in range(3))
+# [m] longest way to the skin over which friction sees the whole motion; accuracy of where it is met; from the
+# BioTac's frame to its skin
+_SHORT, _NARROW, _REACH = (wp.constant(real(x)) for x in (5e-4, 1e-4, 0.02))
+_MOST = wp.constant(64)  # measures of a way
 # by which distances may change faster than places: grids are trilinear
 _ROOT3 = wp.constant(wp.float64(3**0.5))
 _SPREAD = wp.constant(real(1.0 + WINDOW))  # radii of a face by which it is nearer than its centre at most
@@ -85,6 +89,46 @@ def margin_of(laws: Laws, w: int):
     return margin
 
 
+@wp.func
+def _nearest(
+    w: int, t: int, skin: Surfaces, geoms: Geoms, x: wp.array2d(dtype=vec3), first: int, reach: real
+):
+    """Distance of the nearest geom from the skin [m], and the part of the faces where it is; that of any
+    touch if one is nearer than reach. The threads of a block measure a face each, part by part from the first
+    one on, which should be the nearest: the balls of other faces are then mostly further away."""
+    own = w % x.shape[1]
+    parts = (skin.face.shape[0] + wp.block_dim() - 1) / wp.block_dim()
+    part = first
+    closest = first
+    nearest = real(wp.inf)
+    p = vec3()
+    around = real(-wp.inf)  # least distance of a geom from p, which bounds that of the faces next to it
+    done = int(0)
+    while done < parts:
+        f = part * wp.block_dim() + t
+        least = nearest
+        if f < skin.face.shape[0]:
+            i = skin.face[f]
+            x0 = x[i[0], own]
+            x1 = x[i[1], own]
+            x2 = x[i[2], own]
+            center, radius = face_ball(x0, x1, x2)
+            if around - _ROOT3 * wp.length(center - p) - _SPREAD * radius < nearest:
+                ball, _beyond, _count, _within = face_clearance(x0, x1, x2, w, geoms, ALL, real(0.0))
+                p = center
+                around = ball + radius
+                if ball < nearest:
+                    least = sample_clearance(x0, x1, x2, skin.sample, w, geoms, ALL, nearest, reach)
+                    least = wp.max(ball, least)
+        least = -block_max(-least)
+        if least < nearest:
+            nearest = least
+            closest = part
+        part = (part + 1) % parts
+        done = wp.where(nearest < reach, parts, done + 1)
+    return nearest, closest
+
+
 @wp.kernel
 def find_clearance(
     # In:
@@ -106,11 +150,8 @@ def find_clearance(
     after its motion since the last time. In others with finite poses it is infinite or, where a geom was near
     and may still be, a bound.
 
-    One block per world: each time its threads have measured a face each, they end if one is touched. They
-    begin with those among which the last nearest face was: of others the ball is mostly further away.
-
     Args:
-      wanted: BOUND, TOUCH or EXACT.
+      wanted: BOUND, TOUCH or EXACT. touched: where `_nearest` begins.
     """
     w, t = wp.tid()
     known = on[w]
@@ -136,49 +177,84 @@ def find_clearance(
         clearance_out[w] = clearance
     if close == 0:
         return
-    threads = wp.block_dim()
-    own = w % x.shape[1]
-    parts = (skin.face.shape[0] + threads - 1) / threads
-    part = touched[w]
-    closest = part
-    nearest = real(wp.inf)
-    p = vec3()
-    around = real(-wp.inf)  # least distance of a geom from p, which bounds that of the faces next to it
-    done = int(0)
-    while done < parts:
-        f = part * threads + t
-        least = nearest
-        if f < skin.face.shape[0]:
-            i = skin.face[f]
-            x0 = x[i[0], own]
-            x1 = x[i[1], own]
-            x2 = x[i[2], own]
-            center, radius = face_ball(x0, x1, x2)
-            if around - _ROOT3 * wp.length(center - p) - _SPREAD * radius < nearest:
-                ball, _beyond, _count, _within = face_clearance(x0, x1, x2, w, geoms, ALL, margin)
-                p = center
-                around = ball + radius
-                if ball < nearest:
-                    least = wp.max(
-                        ball, sample_clearance(x0, x1, x2, skin.sample, w, geoms, ALL, nearest, reach)
-                    )
-        least = -block_max(-least)
-        if least < nearest:
-            nearest = least
-            closest = part
-        part = (part + 1) % parts
-        done = wp.where(nearest < reach, parts, done + 1)
+    nearest, part = _nearest(w, t, skin, geoms, x, touched[w], reach)
     inside = real(wp.inf)
     if nearest >= reach:
-        inside = geoms_core_clearance(w, t, threads, geoms, ALL, skin.core, skin.core_vert)
+        inside = geoms_core_clearance(w, t, wp.block_dim(), geoms, ALL, skin.core, skin.core_vert)
     if t == 0:
-        touched[w] = closest
+        touched[w] = part
         clearance_out[w] = wp.vec2d(nearest, inside)
         if seen.clearance.shape[0] > 0:
             seen.clearance[w] = clearance_out[w]
             for g in range(geoms.count):
                 seen.pos[g, w] = geoms.pos[g, w]
                 seen.mat[g, w] = geoms.mat[g, w]
+
+
+@wp.kernel
+def begin_where_met(
+    # In:
+    skin: Surfaces,
+    laws: Laws,
+    on: wp.array(dtype=int),
+    x: wp.array2d(dtype=vec3),
+    # In and out:
+    touched: wp.array(dtype=int),
+    geoms: Geoms,
+    to_pos: wp.array2d(dtype=vec3),
+    to_mat: wp.array2d(dtype=mat33),
+):
+    """Lets geoms that come to a resting skin on a long way begin their step where they meet it, to within 0.1
+    mm: what they did before is none of its friction's. In the worlds that are on, of geoms with known poses.
+    to_pos, to_mat: scratch [geom, world]."""
+    w, t = wp.tid()
+    far = real(0.0)
+    for g in range(geoms.count):
+        turn = geoms.mat[g, w] * wp.transpose(geoms.mat_last[g, w])
+        shift = wp.length(geoms.pos[g, w] - turn * geoms.pos_last[g, w])
+        turn = turn - wp.identity(n=3, dtype=real)
+        moved = shift + _REACH * wp.sqrt(wp.ddot(turn, turn))
+        if not moved <= far:
+            far = moved
+    if on[w] == 0 or far < _SHORT or not wp.isfinite(far):
+        return
+    reach = contact_range(laws, w)
+    for g in range(t, geoms.count, wp.block_dim()):
+        to_pos[g, w] = geoms.pos[g, w]
+        to_mat[g, w] = geoms.mat[g, w]
+    part = touched[w]
+    at = real(0.0)
+    clear = real(0.0)
+    goes = int(_MOST)
+    while goes > 0:
+        _pose_between(w, t, at, geoms, to_pos, to_mat)
+        nearest, part = _nearest(w, t, skin, geoms, x, part, reach)
+        goes -= 1
+        if nearest >= reach:
+            clear = at
+        if nearest < reach + _NARROW or at == real(1.0):
+            goes = 0
+        at = wp.min(real(1.0), at + (nearest - reach) / (_ROOT3 * far))
+    _pose_between(w, t, clear, geoms, to_pos, to_mat)
+    for g in range(t, geoms.count, wp.block_dim()):
+        geoms.pos_last[g, w] = geoms.pos[g, w]
+        geoms.mat_last[g, w] = geoms.mat[g, w]
+        geoms.pos[g, w] = to_pos[g, w]
+        geoms.mat[g, w] = to_mat[g, w]
+
+
+@wp.func
+def _pose_between(
+    w: int, t: int, at: real, geoms: Geoms, to_pos: wp.array2d(dtype=vec3), to_mat: wp.array2d(dtype=mat33)
+):
+    """Poses the geoms on their way from where they were last: on a straight line, along the shortest arc."""
+    sync()
+    for g in range(t, geoms.count, wp.block_dim()):
+        R = geoms.mat_last[g, w]
+        m = motion(vec3(), to_mat[g, w], vec3(), R)
+        geoms.pos[g, w] = (real(1.0) - at) * geoms.pos_last[g, w] + at * to_pos[g, w]
+        geoms.mat[g, w] = rotation(at * vec3(m[3], m[4], m[5])) * R
+    sync()
 
 
 def make_seen(ngeom: int, nworld: int) -> Seen:
@@ -202,7 +278,7 @@ class Clearance:
         core [m]; infinite where no geom is close. Where the skin is touched it is that of any touch.
     """
 
-    def __init__(self, model: "SkinModel", nworld: int, seen: object = None):
+    def __init__(self, model: "SkinModel", ngeom: int, nworld: int, seen: object = None):
         self._device, vert = model.device, model.rest.vert
         center = (vert.min(0) + vert.max(0)) / 2
         # wider than any skin at rest is than another of this model: liquids differ by world
@@ -213,6 +289,7 @@ class Clearance:
             self._seen = make_seen(0, 0) if seen is None else seen
             self.known, self._touched = (wp.zeros(nworld, dtype=int) for _ in range(2))
             self.found = wp.zeros(nworld, dtype=wp.vec2d)
+            self._way = [wp.zeros((ngeom, nworld), dtype=kind) for kind in (vec3, mat33)]
         if model.has_core:
             self.skin.core_vert, self.skin.core = model.core_vert, model.core(nworld).struct
 
@@ -231,3 +308,11 @@ class Clearance:
         found = [self._touched, self._seen, self.known, self.found]
         launcher = launcher or Launcher(self._device)
         launcher.launch_blocks(find_clearance, [len(on)], known, found)
+
+    def begin_where_met(
+        self, on: wp.array, geoms: Geoms, laws: Laws, x: wp.array, launcher: Launcher | None = None
+    ) -> None:
+        """See the kernel; on: (nworld,) int. Launches only."""
+        launcher = launcher or Launcher(self._device)
+        known, way = [self.skin, laws, on, x], [self._touched, geoms, *self._way]
+        launcher.launch_blocks(begin_where_met, [len(on)], known, way)

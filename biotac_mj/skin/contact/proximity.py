@@ -6,7 +6,6 @@ import typing
 import numpy as np
 import warp as wp
 
-from ...geometry.rigid import displace, displacement
 from ...geometry.surface import face_areas
 from ...launches import recorded
 from ..geoms import GeomSet
@@ -20,9 +19,7 @@ from .penetration import measure_core
 if typing.TYPE_CHECKING:
     from ..model import SkinModel
 
-_NARROW = 1e-4  # [m] accuracy of the position at first contact
 _CORE = 1e-6  # [m] accuracy of the position at which a geom leaves the core
-_LEAST_INTERVAL = 1e-9  # of a path in a bisection
 _FAR = 1.0  # [m] most motion of a geom out of the skin
 
 
@@ -37,16 +34,20 @@ class ProximityQuery:
         geoms.resolve(model.spacing, model.options.samples)
         struct = geoms.struct
         self._model, self._geoms = model, geoms
-        self._now = struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0]
+        self._now, self._last = (
+            (a.numpy()[:, 0], b.numpy()[:, 0])
+            for a, b in ((struct.pos, struct.mat), (struct.pos_last, struct.mat_last))
+        )
         self._rest, self._face = np.ascontiguousarray(model.rest.vert, float), model.outer.face.numpy()
         with wp.ScopedDevice("cpu"):
-            at, on = Clearance(model, 1, make_seen(geoms.count, 1)), wp.ones(1, dtype=int)
+            at, on = Clearance(model, geoms.count, 1, make_seen(geoms.count, 1)), wp.ones(1, dtype=int)
             x, core = wp.array(self._rest[:, None], dtype=vec3), wp.zeros(1, dtype=real)
             self._left, self._turned = (wp.zeros((geoms.count, 1), dtype=kind) for kind in (vec3, mat33))
         self._find = [
             Program("cpu", lambda p, wanted=wanted: at.find(on, struct, laws, x, wanted, p)).run
             for wanted in (BOUND, TOUCH, EXACT)
         ]
+        self._meet = Program("cpu", lambda p: at.begin_where_met(on, struct, laws, x, p)).run
         self._finite, self._found, self._core = at.known.numpy(), at.found.numpy(), core.numpy()
         self._known = on, model.outer.face, model.sample, x, struct
         touch = max(float(a.numpy().max(initial=0.0)) for a in (laws.reach, laws.smoothing))
@@ -65,18 +66,15 @@ class ProximityQuery:
         (skin, core), limit = self._found[0].tolist(), self._model.options.max_core_depth
         return bool(self._finite[0]) and skin >= self._limits[wanted] and core >= -limit
 
-    def last_clear(
+    def met(
         self, pos0: np.ndarray, mat0: np.ndarray, pos: np.ndarray, mat: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Last poses (ngeom, 3) [m], (ngeom, 3, 3), to within 0.1 mm, that are `clear` on the path from pos0,
-        mat0, which are clear, to pos, mat."""
-        path, low, high = displacement(pos, mat, pos0, mat0), 0.0, 1.0
-        far = np.abs(path).max(initial=0.0)
-        while (high - low) * far > _NARROW and high - low > _LEAST_INTERVAL:
-            middle = 0.5 * (low + high)
-            clear = self.clear(*displace(pos0, mat0, middle * path))
-            low, high = (middle, high) if clear else (low, middle)
-        return displace(pos0, mat0, low * path)
+        """Poses (ngeom, 3) [m], (ngeom, 3, 3) where the step of geoms that go from pos0, mat0 to pos, mat
+        begins for a skin at rest, see `clearance.begin_where_met`."""
+        self.pose(pos, mat)
+        self._last[0][...], self._last[1][...] = pos0, mat0
+        self._meet()
+        return self._last[0].copy(), self._last[1].copy()
 
     def outside(self, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
         """Positions (ngeom, 3) [m] of the geoms after each is moved out of the undeformed skin, along the
