@@ -101,6 +101,52 @@ def test_what_a_mocap_body_leads_slides():
     assert abs(force[0]) > 0.6 * abs(force[1])
 
 
+HEIGHTS = 0.0005, 0.002, 0.02, 0.1  # [m] above where a ball touches the skin
+
+
+def landed(tier, engine):
+    """Forces (n, 3) [N] of a mocap ball that goes straight down into the skin in one step, from HEIGHTS."""
+    spec = mujoco.MjSpec.from_string(BODY.format(shape=BALL).replace("<freejoint/>", "").replace(
+        'name="body">', 'name="body" mocap="true">', 1))  # fmt: skip
+    settings = dict(skin="coarse", tier=tier, readings=False, friction=1.0)
+    end, above = np.array(INTO[0]), np.outer(0.00085 + np.array(HEIGHTS), [0, 0, 1])
+    if engine == "mj_step":
+        handle = biotac_mj.attach(spec, site="mount", **settings)
+        model, out = spec.compile(), []
+        data = mujoco.MjData(model)
+        for start in end + above:
+            mujoco.mj_resetData(model, data)
+            for pos in (start, start, end):
+                data.mocap_pos[0] = pos
+                mujoco.mj_step(model, data)
+            out.append(handle.read(data, "contact_force")[:3].copy())
+        return np.array(out)
+    mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+    from biotac_mj import batch
+
+    prefix = batch.add(spec, site="mount", skin="coarse")
+    mjm = spec.compile()
+    with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
+        m, d = mjw.put_model(mjm), mjw.make_data(mjm, nworld=len(HEIGHTS))
+        mjw.reset_data(m, d)
+        batch.attach(mjm, m, d, prefix=prefix, **settings)
+        for pos in (end + above, end + above, end + 0 * above):
+            d.mocap_pos.assign(pos[:, None].astype(np.float32))
+            mjw.step(m, d)
+    return d.sensordata.numpy()[:, mjm.sensor(f"{prefix}contact_force").adr[0] :][:, :3]
+
+
+@pytest.mark.law
+@pytest.mark.parametrize("engine", ["mj_step", "batch"])
+@pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
+def test_a_landing_does_not_tell_where_its_way_began(tier, engine):
+    """Friction begins where the skin at rest is met."""
+    force = landed(tier, engine)
+    sideways, load = np.hypot(force[:, 0], force[:, 2]), np.abs(force[:, 1])
+    assert load.min() > 0.2 and np.ptp(load) < 0.02 * load.mean()
+    assert (sideways < 0.08 * load).all() and np.ptp(sideways) < 0.02 * load.mean()
+
+
 @pytest.mark.law
 @pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
 def test_in_a_batch_who_is_put_somewhere_did_not_slide_there(tier):

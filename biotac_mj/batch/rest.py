@@ -165,8 +165,9 @@ def skip_untouched(
     elif clearance[w][0] < margin_of(laws, w):
         near = NEAR
     s.near[w] = near
-    gone_out[w] = near == AFAR or (near == NEAR and s.undeformed[w] == 1)
-    met_out[w] = wp.where(near == TOUCHING, st.wanted[w] * wp.max(s.resting[w], s.undeformed[w]), 0)
+    rests = wp.max(s.resting[w], s.undeformed[w])
+    gone_out[w] = near == AFAR or (near == NEAR and rests == 1)
+    met_out[w] = wp.where(near == TOUCHING, st.wanted[w] * rests, 0)
     if gone_out[w]:
         st.wanted[w] = 0
 

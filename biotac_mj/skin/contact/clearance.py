@@ -30,7 +30,7 @@ _CLEAR = wp.constant(real(CLEAR))
 BOUND, TOUCH, EXACT = (wp.constant(i) for i in range(3))
 # [m] longest way to the skin over which friction sees the whole motion; accuracy of where it is met; from the
 # BioTac's frame to its skin
-_SHORT, _NARROW, _REACH = (wp.constant(real(x)) for x in (5e-4, 1e-4, 0.02))
+_SHORT, _NARROW, _REACH = (wp.constant(real(x)) for x in (5e-4, 1e-5, 0.02))
 _MOST = wp.constant(64)  # measures of a way
 # by which distances may change faster than places: grids are trilinear
 _ROOT3 = wp.constant(wp.float64(3**0.5))
@@ -204,8 +204,8 @@ def begin_where_met(
     to_pos: wp.array2d(dtype=vec3),
     to_mat: wp.array2d(dtype=mat33),
 ):
-    """Lets geoms that come to a resting skin on a long way begin their step where they meet it, to within 0.1
-    mm: what they did before is none of its friction's. In the worlds that are on, of geoms with known poses.
+    """Lets geoms that come to a resting skin on a long way begin their step where they meet it, to within 10
+    um: what they did before is none of its friction's. In the worlds that are on, of geoms with known poses.
     to_pos, to_mat: scratch [geom, world]."""
     w, t = wp.tid()
     far = real(0.0)
