@@ -38,7 +38,7 @@ class Sleep:
     woken: wp.array(dtype=int)  # in this step, by a geom that comes near
     near: wp.array(dtype=int)  # AFAR, NEAR or TOUCHING
     at_rest: wp.array(dtype=int)  # came to rest by the last solve
-    undeformed: wp.array(dtype=int)  # and has stayed so
+    undeformed: wp.array(dtype=int)  # rests, since a reset or by the last step
     resting: wp.array(dtype=int)  # sleeps
     unsettled: wp.array(dtype=int)  # steps in a row that did not settle
     own: wp.array(dtype=vec4)  # constants as it was made, and as it fell asleep
@@ -165,9 +165,8 @@ def skip_untouched(
     elif clearance[w][0] < margin_of(laws, w):
         near = NEAR
     s.near[w] = near
-    rests = wp.max(s.resting[w], s.undeformed[w])
-    gone_out[w] = near == AFAR or (near == NEAR and rests == 1)
-    met_out[w] = wp.where(near == TOUCHING, st.wanted[w] * rests, 0)
+    gone_out[w] = near == AFAR or (near == NEAR and s.undeformed[w] == 1)
+    met_out[w] = wp.where(near == TOUCHING, st.wanted[w] * s.undeformed[w], 0)
     if gone_out[w]:
         st.wanted[w] = 0
 
@@ -328,15 +327,16 @@ class Rest:
             self._any_reset, self._met = wp.zeros(1, dtype=int), wp.zeros(n, dtype=int)
             self._sleep, st = Sleep(), data.worlds
             s = self._sleep
-            add_zeros(s, "woken near at_rest undeformed resting", n)
-            s.awake, s.unsettled, s.seen = self.awake, self.unsettled, make_seen(skin.geoms.count, n)
+            add_zeros(s, "woken near at_rest resting", n)
+            s.awake, s.unsettled, s.undeformed = self.awake, self.unsettled, self.undeformed
+            s.seen = make_seen(skin.geoms.count, n)
             made = np.stack([a.numpy() for a in (st.mu, st.lam, st.kappa, st.natural)], axis=1)
             s.own, s.constants = (wp.array(made, dtype=vec4) for _ in range(2))
         many = skin.geoms.count, n
         self._from_asleep, self.clearance = Clearance(model, *many, s.seen), Clearance(model, *many)
         self._filled = int(bool(model.options.fill_volume or model.options.rest_pressure or data.rests))
         seen = [s.seen.pos, s.seen.mat, s.seen.clearance]
-        self.lasting = [s.resting, s.constants, *seen, s.undeformed]
+        self.lasting = [s.resting, s.constants, *seen]
 
     # --- a step ---
 

@@ -177,9 +177,10 @@ VARIABLES = (
     # tier of the last step, for the sensor `status`, as `full_tier`
     Variable("tier", "step.tier", (), int, 1, OUTCOME, **_CONDENSED),
     # of `batch.skin.BatchSkin`: 1: no step was made since the reset; number of steps without motion of the
-    # skin; results of the last step
+    # skin; 1: it rests; results of the last step
     Variable("fresh", "batch.fresh", (), int, 1, MEMORY, saved=(), needs=("implicit",), **_OF_STEPS),
     Variable("unsettled", "rest.unsettled", (), int, 0, MEMORY, saved=(), **_OF_STEPS),
+    Variable("undeformed", "rest.undeformed", (), int, 1, MEMORY, saved=()),
     Variable("batch_pressure", "batch.pressure", (), real, 0.0, OUTCOME),
     Variable("batch_wrench", "batch.wrench", ("group",), wp.spatial_vectord, 0.0, OUTCOME, **_OF_STEPS),
     Variable("batch_tangent", "batch.tangent", ("group",), wp.spatial_matrixd, 0.0, OUTCOME, **_OF_STEPS),
