@@ -407,7 +407,7 @@ def test_narrow_balls_that_reach_the_core_gain_nothing(seed):
 
 
 @pytest.mark.law
-@pytest.mark.parametrize("seed", [48, 50, 54, 56])
+@pytest.mark.parametrize("seed", [45, 50, 54, 56])
 def test_a_ring_that_comes_into_the_core_gains_nothing(seed):
     """Its contact with the core lifts it against a skin that holds it from the other side: both together give
     no more than was put in."""

@@ -214,7 +214,7 @@ def test_a_filled_skin_is_that_of_the_full_fem():
         model.rest.pressure == pytest.approx(3e3, rel=1e-2)
         and np.abs(model.rest.vert - model.geometry.vert).max() > 1e-5
     )
-    geoms.set_pose((start - 1e-3 * direction)[None])
+    geoms.set_pose(start[None])  # where the other has met the skin
     for c, depth in zip(walk(skin, start + np.outer(depths, direction), away.memory), depths):
         geoms.set_pose((start + depth * direction)[None])
         step(model, data, geoms)
