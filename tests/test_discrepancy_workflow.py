@@ -645,8 +645,7 @@ def test_a_cause_has_one_law(monkeypatch):
 
 
 def test_signed_roots_have_the_rate_of_chance():
-    from biotac_mj.discrepancy.evidence import signed_root_t
-    from biotac_mj.quality.evidence import sign_flip
+    from biotac_mj.quality.evidence import sign_flip, signed_root_t
 
     real, lucky = np.array([30.0, 20, 18, 15, 14, -1]), np.array([60, 0.5, 0.3, -0.2, -0.1, -0.4])
     assert sign_flip(real) == 2 / 64 and signed_root_t(real) < 0.02 < signed_root_t(lucky)

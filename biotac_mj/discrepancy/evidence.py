@@ -1,7 +1,6 @@
 """Evidence whose unit is the block of time or the trajectory, never the sample, and what of it is enough."""
 
 import numpy as np
-from scipy.special import stdtr
 from scipy.stats import false_discovery_control
 
 from ..quality.evidence import signs
@@ -9,7 +8,7 @@ from ..quality.evidence import signs
 RATE = 1 / 21  # of false discoveries
 ODDS = (1 - RATE) / RATE  # how much likelier than all else an explanation has to be
 
-# scipy has no max-T and no test of signed roots
+# scipy has no max-T
 
 
 def log_ratio(
@@ -57,18 +56,6 @@ def further_off(before: np.ndarray, after: np.ndarray, chance: np.ndarray | None
     if chance is None:
         chance = change.std(0, ddof=1) * np.sqrt(len(change))
     return bool((change.sum(0) > chance).any())
-
-
-def signed_root_t(gain: np.ndarray) -> float:
-    """p of mean(gain) > 0 by Student's t of the signed square roots; gain (n,), n at least 2, of log
-    likelihoods.
-
-    A gain is the square of what an effect does over its noise, so its root scatters by about one whatever its
-    size, and one unit that gains much does not decide. Among six units a single small loss leaves a sign flip
-    at 2/64 however much the others gain; here it counts as what it is."""
-    root = np.sign(gain) * np.sqrt(np.abs(gain))
-    error = max(float(root.std(ddof=1)) / np.sqrt(len(root)), 1e-9)
-    return float(stdtr(len(root) - 1, -root.mean() / error))
 
 
 def max_t(statistic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from scipy.ndimage import median_filter
 
 from ..sensor.channels import electrode_noise
 from .adjacent import last_measured
-from .evidence import BLOCKS, evidence, runs
+from .evidence import BLOCKS, evidence, runs, signed_root_t
 from .fault import Fault
 from .log import Log
 
@@ -77,7 +77,7 @@ def noisy(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
                 {"size": (float(np.median(size)), float(size.min()), float(size.max()))},
                 detector="loud",
                 ties=("gain",),
-                **evidence(strength[some]),
+                **evidence(strength[some]) | {"p": signed_root_t(strength[some])},  # also of few blocks
             )
         )
     return found

@@ -11,10 +11,10 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from ....effects.effect import stop
-from ....quality.evidence import BLOCKS
+from ....quality.evidence import BLOCKS, signed_root_t
 from ....quality.noise import ROUNDING
 from ....sensor.channels import log_impedance
-from ...evidence import ODDS, log_ratio, signed_root_t
+from ...evidence import ODDS, log_ratio
 from ..candidates import KINDS, Candidate
 from ..model import slope_of
 from ..session import Session

@@ -8,7 +8,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import connected_components
 
 from ....effects.electrodes import Exchange
-from ...evidence import signed_root_t
+from ....quality.evidence import signed_root_t
 
 if typing.TYPE_CHECKING:
     from ..fitting import Fit
