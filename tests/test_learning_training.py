@@ -27,13 +27,12 @@ from biotac_mj.geometry import load_skin  # noqa: E402
 from biotac_mj.learning.patch import contact_patch, estimate  # noqa: E402
 from biotac_mj.learning.report import evaluate_models, table  # noqa: E402
 from biotac_mj.learning.serve import LearnedBatchFilm, NetworkFilm  # noqa: E402
-from biotac_mj.learning.training import fitting  # noqa: E402
+from biotac_mj.learning.training import experiment  # noqa: E402
 from biotac_mj.learning.training.arrays import load_arrays  # noqa: E402
 from biotac_mj.learning.training.config import LearningConfig  # noqa: E402
 from biotac_mj.learning.training.experiment import train_all  # noqa: E402
 from biotac_mj.learning.training.features import mirror_order  # noqa: E402
 from biotac_mj.learning.training.few_shot import evaluate_new_sensor, fit_gains, fit_mixing, simplest_mixing  # noqa: E402
-from biotac_mj.learning.training.fitting import Checkpoints  # noqa: E402
 from biotac_mj.learning.training.inverse import contact_centre, log_change_of, patch_overlap  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
 from biotac_mj.sensor import PhysicsReadings  # noqa: E402
@@ -125,39 +124,36 @@ def test_training_goes_on_where_it_was_interrupted(trained, folder):
 
 
 @pytest.mark.slow
-def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, tmp_path, monkeypatch):
-    begin, steps = Checkpoints.__init__, []
+def test_a_stopped_training_goes_on_to_the_same_bits(trained, folder, tmp_path, monkeypatch):
+    stopped, begin = [], experiment.train_split
 
-    def counted(n):
-        steps.append(n)
-        if len(steps) == 400:  # within the inverse, between two of its states that are kept
+    def counted(*args):
+        if args[1] == "ring_7mm" and not stopped:
+            stopped.append(True)
             raise KeyboardInterrupt
+        return begin(*args)
 
-    same = dict(paper=False, progress=False)
-    monkeypatch.setattr(Checkpoints, "__init__", lambda self, folder, report: begin(self, folder, counted))
-    monkeypatch.setattr(fitting, "_BETWEEN", 0.0)
+    on, same = ((0,), ("trajectory", "ring_7mm"), SMALL), dict(paper=False, progress=False)
+    monkeypatch.setattr(experiment, "train_split", counted)
     with pytest.raises(KeyboardInterrupt):
-        train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, **same)
-    (kept,) = tmp_path.glob("unfinished-*")
-    assert len(list(kept.iterdir())) == 3
-    train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, **same)
-    done = steps[400:]
-    # two whole trainings, and the third up to a state that was kept
-    assert done[:2] == [120, 120] and 0 < done[2] < 240
-    for name in ("trajectory-0.npz", "forward-trajectory.safetensors", "inverse-trajectory.safetensors"):
-        assert (tmp_path / name).read_bytes() == (trained / name).read_bytes()
-    assert not kept.exists()
+        train_all(folder, tmp_path, *on, **same)
+    stamp = (tmp_path / "trajectory-0.json").stat().st_mtime_ns
+    train_all(folder, tmp_path, *on, **same)
+    assert (tmp_path / "trajectory-0.json").stat().st_mtime_ns == stamp  # is not trained again
+    for split in on[1]:
+        for name in (f"{split}-0.npz", f"forward-{split}.safetensors", f"inverse-{split}.safetensors"):
+            assert (tmp_path / name).read_bytes() == (trained / name).read_bytes()
 
 
 @pytest.mark.slow
 def test_the_bar_reaches_its_end(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)  # elsewhere no bar is drawn
-    begin, steps = Checkpoints.__init__, []
+    begin, steps = experiment.train_split, []
 
-    def counted(self, folder, report):
-        begin(self, folder, lambda n: [steps.append(n), report(n)])
+    def counted(*args):
+        begin(*args[:-1], lambda n: [steps.append(n), args[-1](n)])
 
-    monkeypatch.setattr(Checkpoints, "__init__", counted)
+    monkeypatch.setattr(experiment, "train_split", counted)
     train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, paper=False)
     said, bar = capsys.readouterr()
     total = 120 * (2 + 3)  # the head, the inverse

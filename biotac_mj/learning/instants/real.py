@@ -158,7 +158,7 @@ def _through_code(counts, ntrain, seed, steps, bar):
     import torch
 
     from ..networks.electrode_vae import ElectrodeVAE
-    from ..training.fitting import Checkpoints, TrainingOptions, train
+    from ..training.fitting import TrainingOptions, train
 
     torch.manual_seed(seed)
     size, mean = counts[:ntrain].std(), counts[:ntrain].mean(0)  # one scale for all channels
@@ -170,7 +170,7 @@ def _through_code(counts, ntrain, seed, steps, bar):
         return net.loss(x[row] + _GAIN * torch.randn(len(row), 1) * common[row], _KL)
 
     options = TrainingOptions(_BATCH, steps, 1e-3, seed=seed)
-    train(net, loss, torch.arange(ntrain), options, checkpoints=Checkpoints(report=bar.update))
+    train(net, loss, torch.arange(ntrain), options, progress=bar.update)
     with torch.no_grad():
         return net(x)[0].numpy() * size + mean
 

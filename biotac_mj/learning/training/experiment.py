@@ -3,12 +3,10 @@ weights to a folder."""
 
 import contextlib
 import dataclasses
-import hashlib
 import json
 import pathlib
-import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
@@ -25,7 +23,6 @@ from ..weights import save_forward, save_inverse, save_points_model
 from .arrays import check_columns, load_arrays, spread_rows
 from .config import LearningConfig
 from .features import Pod
-from .fitting import Checkpoints
 from .inverse import PATCH, field_errors, inverse_errors, patch_of_push, train_inverse
 from .local import Features, film_with_gains, train_head
 from .paper import network_change, network_target, train_latent_projection, train_pointnet
@@ -45,7 +42,7 @@ def train_all(
     ray: str | None = None,
 ) -> None:
     """Trains and predicts for all splits and seeds. Existing results are kept, so an interrupted run
-    continues, also within a network's training (on Ray: at a split and seed).
+    continues at a split and seed.
 
     On the CPU each training uses one core: the results do not depend on the number of cores.
 
@@ -104,11 +101,7 @@ class _Train:
             for split, seed in values:
                 if not hasattr(self, "_features"):
                     self._features = self._read(report)
-                given = self.settings
-                name = hashlib.sha256(json.dumps([given, self.device, split, seed]).encode()).hexdigest()[:16]
-                checkpoints = Checkpoints(folder / f"unfinished-{name}", report)
-                train_split(self._features, split, seed, folder, given, checkpoints)
-                shutil.rmtree(checkpoints.folder, ignore_errors=True)
+                train_split(self._features, split, seed, folder, self.settings, report)
                 yield split, seed
 
     def _read(self, report):
@@ -155,12 +148,13 @@ def train_split(
     seed: int,
     out: pathlib.Path,
     settings: dict,
-    checkpoints: Checkpoints | None = None,
+    progress: Callable[[int], object] | None = None,
 ) -> None:
     """Trains one split and seed: writes SPLIT-SEED.npz (predictions on validation and test rows), weights of
-    seed 0, and last SPLIT-SEED.json with the settings of the whole training. checkpoints: of all networks."""
+    seed 0, and last SPLIT-SEED.json with the settings of the whole training. progress:
+    called with 1 at each step."""
     arrays, config = features.arrays, features.config
-    path, checkpoints = settings["set"], checkpoints or Checkpoints()
+    path = settings["set"]
     division = division_of(path, split, seed)
     train, validation, test = division.train, division.validation, division.test
     rows, check = arrays.rows(test, labelled=True), arrays.rows(validation, labelled=True)
@@ -188,14 +182,12 @@ def train_split(
 
     more = config.members - 1
     members = [
-        timed(name, lambda seed=k: train_head(features, train, validation, config, seed, pod, checkpoints))
+        timed(name, lambda seed=k: train_head(features, train, validation, config, seed, pod, progress))
         for name, k in [(_HEAD, seed), *((f"{_HEAD} again {k}", 1000 * (k + 1) + seed) for k in range(more))]
     ]
     each = torch.stack([member(both) for member in members])
     predictions[_HEAD], predictions["ensemble"] = each[0], each.mean(0)
-    inverse = timed(
-        _INVERSE, lambda: train_inverse(arrays, train, validation, config, pod, seed, checkpoints)
-    )
+    inverse = timed(_INVERSE, lambda: train_inverse(arrays, train, validation, config, pod, seed, progress))
     report = {
         "split": split,
         "seed": seed,
@@ -216,10 +208,10 @@ def train_split(
         points, there = features.at_points
         lp, report["curves"] = timed(
             "latent_projection",
-            lambda: train_latent_projection(there, points, train, validation, config, seed, checkpoints),
+            lambda: train_latent_projection(there, points, train, validation, config, seed, progress),
         )
         net = timed(
-            "pointnet", lambda: train_pointnet(there, points, train, validation, config, seed, checkpoints)
+            "pointnet", lambda: train_pointnet(there, points, train, validation, config, seed, progress)
         )
         served = {
             name: PointsModel(one, points, arrays.geometry, config, {}).to(device).eval()

@@ -8,18 +8,13 @@ and replayed.
 import contextlib
 import copy
 import dataclasses
-import pathlib
-import time
 from collections.abc import Callable, Iterator
 
 import torch
 from torch.optim.lr_scheduler import LambdaLR, OneCycleLR
 
-from ...files import replacing
-
 _CHECKS = 12  # validations in a training
 _WARM = 5  # warm-up steps before the capture
-_BETWEEN = 5.0  # [s] between two checkpoints: one takes as long as three small steps
 
 
 @contextlib.contextmanager
@@ -32,40 +27,6 @@ def fast_products() -> Iterator[None]:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
-
-
-class Checkpoints:
-    """Checkpoints the trainings of one job. When run again in the same order, finished ones are not repeated,
-    and an interrupted one continues, on the CPU bit-equal.
-
-    Args:
-      folder: of checkpoints, None: no checkpoints. report: progress callback, called with 1 at each step.
-    """
-
-    def __init__(
-        self, folder: pathlib.Path | None = None, report: Callable[[int], object] = lambda n: None
-    ) -> None:
-        self.folder, self.report = folder, report
-        self.number = 0
-        self._kept = time.perf_counter()
-
-    def begin(self) -> dict | None:
-        """Checkpoint of the next training, or None."""
-        self.number += 1
-        path = self._path()
-        kept = torch.load(path, weights_only=True) if path is not None and path.is_file() else None
-        self.report(kept["step"] if kept else 0)
-        return kept
-
-    def keep(self, last: bool, **state: object) -> None:
-        """Saves the training's state: the last one, and others every few seconds."""
-        if self.folder is not None and (last or time.perf_counter() - self._kept >= _BETWEEN):
-            self._kept = time.perf_counter()
-            with replacing(self._path()) as temporary:
-                torch.save(state, temporary)
-
-    def _path(self):
-        return None if self.folder is None else self.folder / f"training-{self.number:02d}.pt"
 
 
 def root_mean_square(error: torch.Tensor) -> torch.Tensor:
@@ -99,7 +60,7 @@ def train(
     rows: torch.Tensor,
     options: TrainingOptions,
     validate: Callable[[], float] | None = None,
-    checkpoints: Checkpoints | None = None,
+    progress: Callable[[int], object] | None = None,
     curve: list | None = None,
 ) -> float | None:
     """Trains a module in place.
@@ -110,7 +71,7 @@ def train(
       rows: (k,) rows to draw from, on the device.
       validate: () -> float, called twelve times; the state with its smallest value is restored at the end.
         None keeps the last.
-      checkpoints: reports and saves the steps. curve: gets [step, value] of each validation.
+      progress: called with 1 at each step. curve: gets [step, value] of each validation.
 
     Returns:
       smallest value of validate, or None.
@@ -131,19 +92,9 @@ def train(
     schedule = _schedule(optimizer, options.learning_rate, steps, options.decay)
     generator = torch.Generator(device=rows.device).manual_seed(options.seed)
     chosen = torch.zeros(min(options.batch, len(rows)), dtype=rows.dtype, device=rows.device)
-    best, state, first = None, None, 0
+    best, state = None, None
     module.train()
     every = max(1, steps // _CHECKS)
-    checkpoints = checkpoints or Checkpoints()
-    kept = checkpoints.begin()
-    if kept:
-        best, state, first = kept["best"], kept["state"], kept["step"]
-        module.load_state_dict(kept["module"])
-        optimizer.load_state_dict(kept["optimizer"])
-        schedule.load_state_dict(kept["schedule"])
-        generator.set_state(kept["generator"])
-        for one, put in zip(kept["random"], (torch.set_rng_state, torch.cuda.set_rng_state)):
-            put(one.cpu())
 
     def one():
         value = loss(chosen)
@@ -153,17 +104,18 @@ def train(
         return value
 
     replay = None
-    for step in range(first, steps):
+    for step in range(steps):
         chosen.copy_(rows[torch.randint(len(rows), chosen.shape, generator=generator, device=rows.device)])
         if replay:
             replay.replay()
-        elif cuda and options.graph and step >= first + _WARM:
+        elif cuda and options.graph and step >= _WARM:
             replay, value = _record(one)
             replay.replay()
         else:
             value = _on_side_stream(one) if cuda and options.graph else one()
         schedule.step()
-        checkpoints.report(1)
+        if progress:
+            progress(1)
         if (step + 1) % every == 0 or step + 1 == steps:
             if not torch.isfinite(value):
                 raise ValueError(
@@ -179,18 +131,6 @@ def train(
                     curve.append([step + 1, now])
                 if best is None or now < best:
                     best, state = now, copy.deepcopy(module.state_dict())
-            checkpoints.keep(
-                last=step + 1 == steps,
-                step=step + 1,
-                best=best,
-                state=state,
-                module=module.state_dict(),
-                optimizer=optimizer.state_dict(),
-                schedule=schedule.state_dict(),
-                generator=generator.get_state(),
-                # dropout and new networks draw from these
-                random=[torch.get_rng_state(), *([torch.cuda.get_rng_state()] if cuda else [])],
-            )
     if state is not None:
         module.load_state_dict(state)
     module.eval()

@@ -14,7 +14,7 @@ from . import fitting
 from .arrays import Arrays
 from .config import LearningConfig
 from .features import Pod, mirror_order, orthogonal_modes
-from .fitting import Checkpoints, TrainingOptions, root_mean_square
+from .fitting import TrainingOptions, root_mean_square
 
 PATCH = 0.15  # fraction of the largest nodal force above which a node is in the patch
 
@@ -59,7 +59,7 @@ def train_inverse(
     config: LearningConfig,
     pod: tuple,
     seed: int = 0,
-    checkpoints: Checkpoints | None = None,
+    progress: Callable[[int], object] | None = None,
 ) -> InverseHead:
     """Trains on the simulation's own film of all training interactions, labelled or not, and, where the
     fingertip is symmetric, of their mirror images, then on labelled ones. pod: (Pod, components of all rows,
@@ -97,10 +97,10 @@ def train_inverse(
         return value if order is None else value + 0.5 * error(r, True, film)
 
     options = TrainingOptions(2 * config.batch, 2 * config.steps, 2 * config.learning_rate, seed=seed)
-    fitting.train(head, symmetric, every, options, checkpoints=checkpoints)
+    fitting.train(head, symmetric, every, options, progress=progress)
     rate = 0.5 * config.learning_rate
     options = TrainingOptions(config.batch, config.steps, rate, weight_decay=0.01, seed=seed)
-    fitting.train(head, error, rows, options, lambda: error(check), checkpoints)
+    fitting.train(head, error, rows, options, lambda: error(check), progress)
     return head
 
 

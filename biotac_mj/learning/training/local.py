@@ -15,7 +15,7 @@ from . import fitting
 from .arrays import Arrays
 from .config import LearningConfig
 from .features import FilmFeatures, Pod, mirror_matrix, mirror_order
-from .fitting import Checkpoints, TrainingOptions, root_mean_square
+from .fitting import TrainingOptions, root_mean_square
 
 MODES = 32  # components of the mesh that a head reads
 
@@ -88,7 +88,7 @@ def train_head(
     config: LearningConfig,
     seed: int,
     pod: tuple,
-    checkpoints: Checkpoints | None = None,
+    progress: Callable[[int], object] | None = None,
 ) -> Callable[[torch.Tensor], torch.Tensor]:
     """Trains one head: first on d ln Z of the simulation's own film in all training interactions, labelled or
     not, and in their mirror images if the fingertip is symmetric; then on the sensor.
@@ -129,11 +129,11 @@ def train_head(
         return value + 0.5 * root_mean_square(output(rows, True) - target[rows][:, order])
 
     options = TrainingOptions(2 * config.batch, config.steps, 2 * config.learning_rate, seed=seed)
-    fitting.train(head, teacher_loss, a.rows(train), options, checkpoints=checkpoints)
+    fitting.train(head, teacher_loss, a.rows(train), options, progress=progress)
     rate = 0.5 * config.learning_rate
     options = TrainingOptions(config.batch, config.steps, rate, weight_decay=0.01, seed=seed)
     error = lambda: root_mean_square(predict(check) - a.change(check))  # noqa: E731
-    fitting.train(head, loss, labelled, options, error, checkpoints)
+    fitting.train(head, loss, labelled, options, error, progress)
 
     @torch.no_grad()
     def evaluate(rows):

@@ -1,6 +1,8 @@
 """The paper's networks (Narang et al., ICRA 2021) on one split: two VAEs, projections between their codes,
 and PointNet++. They read the skin at `SkinPoints`."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import nn
@@ -13,7 +15,7 @@ from ..networks.points import SkinPoints
 from . import fitting
 from .arrays import Arrays, spread_rows
 from .config import LearningConfig
-from .fitting import Checkpoints, TrainingOptions, fast_products, root_mean_square
+from .fitting import TrainingOptions, fast_products, root_mean_square
 from .local import counts_change
 
 
@@ -82,7 +84,7 @@ def train_latent_projection(
     validation: np.ndarray,
     config: LearningConfig,
     seed: int = 0,
-    checkpoints: Checkpoints | None = None,
+    progress: Callable[[int], object] | None = None,
 ) -> tuple[LatentProjection, dict]:
     """Trains both VAEs, freezes them, trains the projections.
 
@@ -108,7 +110,7 @@ def train_latent_projection(
     options = TrainingOptions(config.mesh_batch, config.mesh_steps, config.learning_rate, decay=config.decay,
                               seed=seed, graph=False)  # fmt: skip
     mesh_loss = lambda rows: vae.loss(field(rows), config.mesh_kl)  # noqa: E731
-    fitting.train(vae, mesh_loss, mesh_rows, options, mesh_validate, checkpoints, curves["mesh"])
+    fitting.train(vae, mesh_loss, mesh_rows, options, mesh_validate, progress, curves["mesh"])
 
     rows, check = arrays.rows(train, labelled=True), arrays.rows(validation, labelled=True)
     both = torch.cat([rows, check])
@@ -119,7 +121,7 @@ def train_latent_projection(
 
     electrode_loss = lambda r: electrode.loss(y[r], config.electrode_kl)  # noqa: E731
     error = lambda: (electrode(y[check])[0] - y[check]).square().mean()  # noqa: E731
-    fitting.train(electrode, electrode_loss, rows, options, error, checkpoints, curves["electrode"])
+    fitting.train(electrode, electrode_loss, rows, options, error, progress, curves["electrode"])
 
     for network in (vae, electrode):
         network.requires_grad_(False)
@@ -151,7 +153,7 @@ def train_latent_projection(
 
     for name, loss in (("to_electrode", forward_loss), ("to_mesh", inverse_loss)):
         error = lambda loss=loss: loss(check)  # noqa: E731
-        fitting.train(getattr(model, name), loss, rows, options, error, checkpoints, curves[name])
+        fitting.train(getattr(model, name), loss, rows, options, error, progress, curves[name])
     return model.eval(), curves
 
 
@@ -163,7 +165,7 @@ def train_pointnet(
     validation: np.ndarray,
     config: LearningConfig,
     seed: int = 0,
-    checkpoints: Checkpoints | None = None,
+    progress: Callable[[int], object] | None = None,
 ) -> PointNet:
     """Trains the baseline on labelled interactions only; arrays: of `Arrays.at_points`. Input and output are
     those of `LatentProjection`."""
@@ -181,5 +183,5 @@ def train_pointnet(
 
     options = TrainingOptions(config.batch, config.paper_steps, config.learning_rate, decay=config.decay,
                               seed=seed, graph=False)  # fmt: skip
-    fitting.train(from_rest, loss, rows, options, validate, checkpoints)
+    fitting.train(from_rest, loss, rows, options, validate, progress)
     return net.eval()
