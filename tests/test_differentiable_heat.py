@@ -12,9 +12,9 @@ from gradients import differences
 from biotac_mj.differentiable import tac_counts, tdc_counts, temperatures
 from biotac_mj.sensor.channels import counts_from_temperature, heating_exponent, thermistor_counts
 from biotac_mj.sensor.heat import ABOVE, BODIES, MADE, THERMISTOR, Heat, HeatParameters, begin_heat
-from biotac_mj.sensor.materials import material_named
+from biotac_mj.sensor.materials import material_of
 
-BODIES_OF = [material_named("steel"), material_named("cork")]
+BODIES_OF = [material_of("steel"), material_of("cork")]
 DT = 0.5
 
 

@@ -349,8 +349,8 @@ def _predict_instants(args):
     if not args.out.endswith(SUFFIXES):
         raise ValueError(f"--out {args.out} ends in none of {', '.join(SUFFIXES)}: give such a name")
     load = dict(rate=args.rate, scale=args.scale, object_name=args.object)
-    where, found, meta = predict(args.model, args.source, args.which, args.tare, **load)
-    write_prediction(args.out, where, found, meta)
+    time, found, meta = predict(args.model, args.source, args.which, args.tare, **load)
+    write_prediction(args.out, time, found, meta)
     strange = found.novelty
     print(
         f"{len(strange)} rows: {', '.join(found.value)}, intervals of {100 * meta['level']:.0f} %; novelty "

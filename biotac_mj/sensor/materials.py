@@ -76,15 +76,20 @@ _NUMBERS = "dict(effusivity=, temperature=)"  # of heat, instead of a name
 def material_of(name: str, choices: Iterable[str] = MATERIALS, numbers: str = _NUMBERS) -> Material:
     """The material in a name: the longest phrase of the table that it contains, among equals the last.
 
-    Case, digits, underscores and plurals are ignored: "acrylic_211", "Steel Vase" and "car_sponges" are
-    found. A material has precedence over an object: a glass bottle is of glass, a bottle of polyethylene.
+    Case, underscores, numbers after them and plurals are ignored: "acrylic_211", "Steel Vase" and
+    "car_sponges" are found. A material has precedence over an object: a glass bottle is of glass, a bottle of
+    polyethylene.
 
     Args:
       choices, numbers: suggestions of the error for an unknown name: names, and what to give instead.
 
     Raises:
-      ValueError: the name has no known word.
+      ValueError: the name has no known word, or another number or an "at", as of a temperature.
     """
+    if re.search(r"[\d@°]|(?<![a-z])at(?![a-z])", re.sub(r"_\d+", "", name.lower())):
+        raise ValueError(
+            f"a material's name is {name!r}: give words alone, to thermal also 'steel at 40' [C]"
+        )
     words = re.findall(r"[a-z]+", name.lower())
     for table in _NAMES:
         for length in range(len(words), 0, -1):
@@ -96,19 +101,6 @@ def material_of(name: str, choices: Iterable[str] = MATERIALS, numbers: str = _N
     close = difflib.get_close_matches(name.lower(), choices, 1)
     names = f"did you mean {close[0]!r}? Or" if close else f"use one of {', '.join(choices)}, or"
     raise ValueError(f"no material is known by {name!r}: {names} give {numbers}")
-
-
-def material_named(name: str, choices: Iterable[str] = MATERIALS, numbers: str = _NUMBERS) -> Material:
-    """`material_of` for a user's text, in which a temperature would be ignored.
-
-    Raises:
-      ValueError: no word is known, or the name has a number or an "at" ("acrylic_211" is a file's name).
-    """
-    if re.search(r"[\d@°]|(?<![a-z])at(?![a-z])", re.sub(r"_\d+", "", name.lower())):
-        raise ValueError(
-            f"a material's name is {name!r}: give words alone, to thermal also 'steel at 40' [C]"
-        )
-    return material_of(name, choices, numbers)
 
 
 def check_choices(value: object, read: Callable) -> None:
@@ -167,7 +159,7 @@ def read_thermal(value: str | Material | Mapping) -> Material:
         raise ValueError(
             f"thermal {dict(value)!r}: effusivity and conductivity must be positive, temperature finite"
         )
-    material = material_named(value["material"]) if "material" in value else None
+    material = material_of(value["material"]) if "material" in value else None
     temperature = numbers.get("temperature", material.temperature if material else ROOM)
     if not {"effusivity", "conductivity"} & set(numbers):
         return _checked(dataclasses.replace(material, temperature=temperature))

@@ -26,7 +26,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from biotac_mj.sensor.acquisition_kernels import SLOT_RATE, draw_normal, slots_until
-from biotac_mj.sensor.materials import material_named
+from biotac_mj.sensor.materials import material_of
 
 from ..kernels import kernel_module
 from ..short_repr import short_repr
@@ -91,7 +91,7 @@ def read_texture(value: str | Texture | Mapping) -> Texture:
     name = value.pop("material", "smooth")
     if name != "smooth":
         numbers = "dict(pitch=, height=) of ridges, or dict(roughness=), in metres"
-        found = material_named(name, ("smooth", *ROUGHNESS), numbers).name
+        found = material_of(name, ("smooth", *ROUGHNESS), numbers).name
         if found not in ROUGHNESS:
             raise ValueError(
                 f"no roughness is known of {name!r}: choose smooth, {', '.join(ROUGHNESS)}, or give {numbers}"

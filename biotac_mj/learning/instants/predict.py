@@ -17,7 +17,7 @@ def predict(
     recording: str | None = None,
     tare: int | None = None,
     **load: object,
-) -> tuple[dict[str, np.ndarray], Prediction, dict]:
+) -> tuple[np.ndarray, Prediction, dict]:
     """Runs a model on all rows.
 
     Args:
@@ -25,8 +25,7 @@ def predict(
       tare: number of first rows of a recording whose mean is the sensor at rest.
 
     Returns:
-      columns that identify the row ("time" [s]), Prediction, and the model's description, with "notes" on
-      the recording.
+      times (n,) [s], Prediction, and the model's description, with "notes" on the recording.
 
     Raises:
       FileNotFoundError, ValueError: no such file, a model that does not fit, or a missing tare.
@@ -42,12 +41,10 @@ def predict(
         if found.pdc is not None and np.isfinite(found.pdc).all():
             pdc = found.pdc - found.pdc[:tare].mean()  # tared or raw counts
     meta = reader.meta | {"notes": notes + assumed}
-    return {"time": found.time}, reader.predict(counts, rest, pdc), meta
+    return found.time, reader.predict(counts, rest, pdc), meta
 
 
-def write_prediction(
-    path: pathlib.Path | str, where: dict[str, np.ndarray], found: Prediction, meta: dict
-) -> None:
+def write_prediction(path: pathlib.Path | str, time: np.ndarray, found: Prediction, meta: dict) -> None:
     """Writes a table (.csv: a column for each number and its half width) or arrays (.h5).
 
     Raises:
@@ -60,13 +57,12 @@ def write_prediction(
         with hdf5(path) as file:
             file.attrs["schema"] = "biotac_mj.prediction/1"
             file.attrs["level"] = meta["level"]
-            for name, value in {**where, "novelty": found.novelty}.items():
-                file[name] = value
+            file["time"], file["novelty"] = time, found.novelty
             for name, value in found.value.items():
                 file[name], file[f"{name}_half"] = value, found.half[name]
                 file[name].attrs["unit"] = file[f"{name}_half"].attrs["unit"] = UNITS[name]
         return
-    columns = dict(where)
+    columns = {"time": time}
     for name, value in found.value.items():
         names = TARGETS[name] or [f"e{i + 1}" for i in range(value.shape[1])]
         columns |= dict(zip(names, value.T))
