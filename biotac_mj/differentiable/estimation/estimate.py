@@ -54,6 +54,15 @@ class Estimate:
     unexplained: float
     deepest: bool
 
+    @classmethod
+    def of(
+        cls, outcome: np.ndarray, wide: float, error: np.ndarray, unexplained: float, deepest: bool
+    ) -> "Estimate":
+        """The contact with an `outcome_of` (7,), half widths of ln of the force and of the centre (3,)."""
+        size, factor = float(np.exp(outcome[0])), float(np.exp(wide))
+        force = size * outcome[4:] / np.linalg.norm(outcome[4:])
+        return cls(outcome[1:4], error, force, size, size / factor, size * factor, unexplained, deepest)
+
 
 def change_of(counts: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """(nelectrode,) change of ln Z from rest.
@@ -191,17 +200,8 @@ class Estimator:
         found = fit(self._starts, film, signal, noise, self.progress)
         spread = np.sqrt(np.diag(found.covariance))
         wide_force, wide = OWN_WIDE
-        size = float(np.exp(found.outcome[0]))
-        return Estimate(
-            centre=found.outcome[1:4],
-            centre_error=wide * spread[1:4],
-            force=size * found.outcome[4:] / np.linalg.norm(found.outcome[4:]),
-            size=size,
-            low=size * float(np.exp(-wide_force * spread[0])),
-            high=size * float(np.exp(wide_force * spread[0])),
-            unexplained=found.unexplained,
-            deepest=False,
-        )
+        wide = wide_force * spread[0], wide * spread[1:4]
+        return Estimate.of(found.outcome, *wide, found.unexplained, False)
 
     def __call__(
         self,
@@ -232,17 +232,9 @@ class Estimator:
         known = belief or believe(n)
         wide_force, wide = WIDE
         force = wide_force * np.sqrt(spread[0] ** 2 + FORCE**2 + known.force_variance)
-        size = float(np.exp(mean[0]))
-        return Estimate(
-            centre=mean[1:4],
-            centre_error=wide * np.sqrt(spread[1:4] ** 2 + PLACE**2),
-            force=size * mean[4:] / np.linalg.norm(mean[4:]),
-            size=size,
-            low=float(np.exp(mean[0] - force)),
-            high=float(np.exp(mean[0] + force)),
-            unexplained=posterior.unexplained(int(p.argmax()), signal),
-            deepest=bool(self.presses.deepest[p.argmax()]),
-        )
+        centre, best = wide * np.sqrt(spread[1:4] ** 2 + PLACE**2), int(p.argmax())
+        unexplained, deepest = posterior.unexplained(best, signal), bool(self.presses.deepest[best])
+        return Estimate.of(mean, force, centre, unexplained, deepest)
 
     def _posterior(self, belief, pressed):
         """Posterior, cached for many rows of a sensor."""
