@@ -6,9 +6,9 @@
 
 Quick are tests that cost at most `--cheap` seconds, and those that cost at most `--line` seconds for each
 line or kernel of the package that no cheaper quick test runs. Tests of the same lines hold different things:
-the first case of a test function counts as ten lines more, that of a function marked `law` as sixty: lines do
-not tell what a test compares, so tests that hold a law of mechanics, or that two engines agree, have this
-mark. The tests that need a module or a fixture share its cost.
+the first case of a test function counts as ten lines more, that of a function marked `law` as 100: lines do
+not tell what a test compares, so tests that hold a law of mechanics, that two engines agree, or a rule of the
+source have this mark. The tests that need a module or a fixture share its cost.
 """
 
 import argparse
@@ -18,7 +18,7 @@ import json
 import pathlib
 
 SLOW = pathlib.Path(__file__).resolve().parents[1] / "tests" / "slow.txt"
-_FUNCTION, _LAW = 10, 60  # lines that a test function counts as
+_FUNCTION, _LAW = 10, 100  # lines that a test function counts as
 
 
 def measured(folder: pathlib.Path) -> dict[str, dict]:
@@ -75,7 +75,7 @@ def shortened(slow: set[str], quick: set[str]) -> list[str]:
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("costs", type=pathlib.Path, help="folder of tests/costs.py")
-    parser.add_argument("--line", type=float, default=0.07, help="seconds for each line that a test adds")
+    parser.add_argument("--line", type=float, default=0.025, help="seconds for each line that a test adds")
     parser.add_argument("--cheap", type=float, default=0.03, help="seconds of a test that adds nothing")
     args = parser.parse_args()
     tests = measured(args.costs)

@@ -58,6 +58,7 @@ def constants(kind):
                 yield name.removeprefix("biotac_mj."), node.lineno, node.value
 
 
+@pytest.mark.law
 def test_the_code_has_no_nineteen_of_its_own():
     found = [
         f"{name}, line {line}" for name, line, value in constants(int) if value == 19 and name not in OTHERS
@@ -65,6 +66,7 @@ def test_the_code_has_no_nineteen_of_its_own():
     assert not found, "\n".join(found)
 
 
+@pytest.mark.law
 def test_texts_say_nelectrode_where_any_design_is_meant():
     found = [
         f"{name}, line {line}: {value.strip()[:60]}"

@@ -7,6 +7,8 @@ import inspect
 import pathlib
 import textwrap
 
+import pytest
+
 PACKAGE = pathlib.Path(__file__).resolve().parents[1] / "biotac_mj"
 
 
@@ -47,6 +49,7 @@ def kernel_functions(text: str) -> list[ast.FunctionDef]:
     ]
 
 
+@pytest.mark.law
 def test_a_constant_is_set_where_it_is_read():
     texts = (path.read_text() for path in PACKAGE.rglob("*.py"))
     functions = [function for text in texts if "@wp." in text for function in kernel_functions(text)]

@@ -3,6 +3,7 @@
 import ast
 import json
 
+import pytest
 from quick_tests import SLOW, chosen, measured, shortened
 
 
@@ -59,6 +60,7 @@ def test_rows_of_all_processes_are_read(tmp_path):
     assert measured(tmp_path).keys() == {"a", "b"}
 
 
+@pytest.mark.law
 def test_slow_txt_names_tests_that_exist(repo):
     names = SLOW.read_text().splitlines()
     assert names == sorted(set(names)) and names

@@ -10,6 +10,7 @@ import pytest
 from imports import circles, imports, modules
 
 REPO = pathlib.Path(__file__).parent.parent
+pytestmark = pytest.mark.law
 # What each folder may import, itself aside; a dotted name is that module alone.
 LAYERS = {
     "arguments": "quiet files units",
