@@ -75,7 +75,8 @@ def test_any_number_of_channels(channels):
     rng = np.random.default_rng(channels)
     counts = as_read(2500 + 6 * rng.standard_normal((4000, channels)))
     assert not faults(counts)
-    held = counts[np.where(np.arange(4000) // 200 % 2, np.arange(4000) // 50 * 50, np.arange(4000))]
+    held = counts.copy()
+    held[1000:1200] = held[1000]
     if channels > 1:  # one alone repeats by chance
         assert [f.id for f in faults(held, clocked=True)] == ["freeze"]
     if channels > 2:  # others tell what noise is
@@ -534,7 +535,7 @@ def test_a_clock_that_leaps_misses_no_row():
 
 
 def held(x):
-    return x[np.arange(len(x)) // 4 * 4]
+    return np.r_[x[:1000], np.repeat(x[1000:1001], 200, axis=0), x[1200:]]
 
 
 def spoiled():
