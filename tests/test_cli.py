@@ -336,3 +336,12 @@ def test_what_a_verb_needs_and_is_not_there_is_named():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 2
     assert "biotac: error: this verb needs torch: pip install 'biotac-mj[learning]'" in done.stderr
+
+
+def test_a_file_in_place_of_a_patchs_folder_is_refused(tmp_path, capsys):
+    """Before the recording is read."""
+    table = tmp_path / "q.csv"
+    table.write_text("mine")
+    assert cli.main(["learn", "predict", "inverse", "nosuch.csv", "--out", str(table)]) == 2
+    assert f"{table} is a file: choose another folder" in capsys.readouterr().err
+    assert table.read_text() == "mine"

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from ..arguments import SEED, add_ray, device, output_file, output_folder, real, whole
 from ..fields import refuse_unknown
-from ..files import check_output_file, quoted
+from ..files import check_output, check_output_file, quoted
 from ..reading import read_json
 from ..recordings.verbs import add_load_arguments, add_which
 
@@ -369,6 +369,7 @@ def _predict_patch(args):
     from .patch import contact_patch
 
     args.out = args.out or "out/contact"
+    check_output(args.out, "contact.png", "contact.json")
     one = contact_patch(args.source, args.out, args.tare or 1, args.row, args.skin, args.model)
     x, y, z = one["centre_mm"]
     print(
