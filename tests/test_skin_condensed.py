@@ -465,7 +465,7 @@ def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_pat
         stiff = coarse.stiffness @ (exact / coarse.material.youngs_modulus)
         assert np.abs(stiff - unit[coarse.free].ravel()).max() < 1e-8
     assert not list(tmp_path.iterdir())
-    at = 3 * fresh.position(outer[1]) + 1, 3 * fresh.position(inner[2]) + np.arange(3)
+    at = 3 * fresh.position[outer[1]] + 1, 3 * fresh.position[inner[2]] + np.arange(3)
     for a, b in ((4, 3 * len(outer) + 2), (3 * len(outer) + 2, 4)):
         there = fresh.rows[4, at[1]].astype(float) @ direction[0] * fresh.largest[4]
         back = fresh.rows[3 * len(outer) + 2, at[0]] * fresh.largest[3 * len(outer) + 2]

@@ -28,8 +28,7 @@ from ..stepper import Geom, SkinResult, SkinStepper
 
 _WORK = 145  # of all solves of a two-way skin's step, see SkinOptions.max_work
 _MORE = 4  # times that at most, for rubber that keeps its volume
-# a third of a lone press's: two-way, the error of single steps is heard as chatter
-_TOLERANCE = 3e-4
+_TOLERANCE = 3e-4  # a third of a lone press's: two-way, the error of single steps is heard as chatter
 # a skin that nothing touches and that is this near to rest has come to rest [m], [Pa]: far below a solve's
 # error
 _RESTS = 1e-8, 1.0

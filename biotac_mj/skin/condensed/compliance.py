@@ -68,7 +68,7 @@ class SurfaceCompliance:
       cache: whether to cache the rows on disk.
 
     Attributes:
-      size: coordinates of the free nodes, the length of a row.
+      size: coordinates of the free nodes, the length of a row. position: (nvert,) of nodes in it, -1: fixed.
       count: contact coordinates.
       rows: (count, size) float16, displacement of the free nodes per unit force along each contact coordinate
         [m/N], times E, over its largest entry: largest (count,) float32.
@@ -86,8 +86,8 @@ class SurfaceCompliance:
     ):
         self._model, self._outer, self._inner, self._direction = model, outer, inner, direction
         self.size, self.count = 3 * len(model.free), 3 * len(outer) + len(inner)
-        self._position = np.full(model.nvert, -1)
-        self._position[model.free] = np.arange(len(model.free))
+        self.position = np.full(model.nvert, -1)
+        self.position[model.free] = np.arange(len(model.free))
         self._scale = 1 / model.material.youngs_modulus
         self._cache = cache
         small = 2 * self.count * (self.size + 2 * self.count) <= _LARGEST_FILE
@@ -132,18 +132,14 @@ class SurfaceCompliance:
         largest = np.abs(rows).max(1).astype(np.float32)
         return (rows / largest[:, None]).astype(np.float16), largest
 
-    def position(self, node: np.ndarray) -> np.ndarray:
-        """Index of free nodes (n,) in a row reshaped to (nfree, 3)."""
-        return self._position[node]
-
     def _make(self):
         made = _Matrices(
             np.empty((self.count, self.count), np.float32),
             np.empty(self.count, np.float32),
             np.empty((self.count, self.size), np.float16),
         )
-        outer = (3 * self._position[self._outer][:, None] + np.arange(3)).ravel()
-        inner = 3 * self._position[self._inner][:, None] + np.arange(3)
+        outer = (3 * self.position[self._outer][:, None] + np.arange(3)).ravel()
+        inner = 3 * self.position[self._inner][:, None] + np.arange(3)
         for start in range(0, self.count, _BATCH):
             batch = np.arange(start, min(start + _BATCH, self.count))
             made.rows[batch], made.largest[batch] = self._compute(batch)

@@ -1,10 +1,9 @@
 """Corrections of the linear skin, fitted to the full FEM (`benchmarks/condensed.py --fit`).
 
-softening  s = (1 + 1 / (H / d + 1 / s_max)) / (1 + q sqrt(w) e^2),  H = h w,  w = 1 + (r / b)^2: factor on
-the
-           displacement by contact forces. The skin wraps around a geom at the depth d, the more the smaller
-           the radius of gyration r of the forces is; compressed between geom and core by the fraction e of
-           its thickness, rubber stiffens (q > 0).
+softening  s = (1 + 1 / (H / d + 1 / s_max)) / (1 + q sqrt(w) e^2),  H = h w,  w = 1 + (r / b)^2: factor
+           on the displacement by contact forces. The skin wraps around a geom at the depth d, the more the
+           smaller the radius of gyration r of the forces is; compressed between geom and core by the
+           fraction e of its thickness, rubber stiffens (q > 0).
 swelling   c = 1 / (1 + p / (k E)): factor on the displacement by pressure, since the skin is stretched.
 """
 

@@ -164,8 +164,8 @@ class LinearSkin:
         self.give = self.compliance.vector(gradient).reshape(-1, 3)
         self.liquid_give = float(np.vdot(self.gradient, self.give))
         position = self.compliance.position
-        along = np.einsum("ij,ij->i", self.give[position(self.inner)], self.away)
-        self.give_at = np.concatenate([self.give[position(self.node)].ravel(), along])
+        along = np.einsum("ij,ij->i", self.give[position[self.inner]], self.away)
+        self.give_at = np.concatenate([self.give[position[self.node]].ravel(), along])
 
     def constants(self, model: "SkinModel") -> Constants:
         """Constants for kernels, made once for each device.

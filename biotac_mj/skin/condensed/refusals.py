@@ -11,8 +11,8 @@ def refuse(rubber: tuple[str, ...], options: SkinOptions, has_liquid: bool, on_c
       options: SkinOptions. has_liquid: whether the skin is filled. on_cuda: whether it is on a CUDA device.
 
     Raises:
-      ValueError: CUDA, inertia, rubber that remembers or stiffens, a contact law, or less
-        liquid than the unstressed skin holds.
+      ValueError: CUDA, inertia, rubber that remembers or stiffens, a contact law, or less liquid
+        than the unstressed skin holds.
     """
     if on_cuda:
         raise ValueError("the condensed tier runs on the CPU: choose device='cpu', or the full tier on CUDA")
