@@ -282,9 +282,30 @@ def test_a_thrown_box_has_the_force_of_the_plugin():
     np.testing.assert_allclose(batch.force, single.force, atol=1e-5 * single.size.max())
 
 
+@pytest.mark.slow
+def test_a_gem_with_corners_has_the_force_of_the_plugin():
+    """Its light body turns fast, so that the integrator's accelerations are not the constraint solver's: what
+    a batch left of that difference, 1e-4 of the wrench, parted the forces by 2e-5."""
+    turn = np.arange(8) * np.pi / 4
+    rings = ((2.2, 1.4, np.pi / 8), (4.0, 0.2, 0.0))
+    rings = [np.stack([r * np.cos(turn + o), r * np.sin(turn + o), 0 * turn + z]) for r, z, o in rings]
+    vert = np.concatenate([*rings, [[0.0], [0.0], [-3.4]]], axis=1).T / 1e3
+    gem = '<body><freejoint/><geom type="mesh" mesh="gem" mass=".03" friction="0"/></body>'
+    asset = f'<asset><mesh name="gem" vertex="{" ".join(f"{x:.5f}" for x in vert.ravel())}"/></asset>'
+    xml = scene(gem, 0.001, 'integrator="implicitfast"').replace("<worldbody>", asset + "<worldbody>")
+    quat = np.random.default_rng(1).normal(size=4)
+    qpos = np.concatenate([[-0.01, 0.0005, 0.0121], quat / np.linalg.norm(quat)]).astype(np.float32)
+    qvel = np.array([0.02, 0.01, -0.12, 0.0, 0.0, 0.0], np.float32)
+    settings = dict(skin="coarse", tier="condensed", friction=0.0)
+    single = in_plugin(xml, qpos, qvel, 26, {"site": "tip"}, **settings)
+    batch = in_batch(xml, qpos[None], qvel[None], 11, {"site": "tip"}, **settings)[0][0]
+    assert batch.touched >= 9 and batch.lost + single.lost == 0
+    np.testing.assert_allclose(batch.force, single.force[:11], atol=1e-5 * single.size.max())
+
+
 @pytest.mark.law
-@pytest.mark.parametrize("integrator, bound", [("Euler", 1e-5), ("implicitfast", 3e-5)])
-def test_the_second_step_of_a_batch_has_the_force_of_the_plugin(integrator, bound):
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_the_second_step_of_a_batch_has_the_force_of_the_plugin(integrator):
     """Friction begins where it was at the end of the first step, in which the skin rests; and the body turns
     in both as MuJoCo's integrator turns it."""
     capsule = '<body><freejoint/><geom type="capsule" size=".00465 .00725" mass=".012"/></body>'
@@ -296,7 +317,7 @@ def test_the_second_step_of_a_batch_has_the_force_of_the_plugin(integrator, boun
     single = in_plugin(xml, qpos, qvel, 5, where, skin="coarse", tier="condensed")
     batch = in_batch(xml, qpos[None], qvel[None], 5, where, skin="coarse", tier="condensed")[0][0]
     assert single.size[0] == 0.0 < single.size[1] and batch.lost + single.lost == 0
-    np.testing.assert_allclose(batch.force, single.force, atol=bound * single.size.max())
+    np.testing.assert_allclose(batch.force, single.force, atol=1e-5 * single.size.max())
 
 
 @pytest.mark.law

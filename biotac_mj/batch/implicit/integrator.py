@@ -33,7 +33,7 @@ kernel_module(__name__)
 
 BLOCK = 64  # threads that correct the forces of a world
 _MAX_CORRECTIONS = wp.constant(MAX_CORRECTIONS)
-_CORRECTED = wp.constant(wp.float64(1e-4))  # of the skins' wrenches: accelerations are of single precision
+_CORRECTED = wp.constant(wp.float64(1e-5))  # of the skins' wrenches: accelerations are of single precision
 _poorly_corrected = wp.func(poorly_corrected)
 _FAST, _IMPLICIT = (
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("IMPLICITFAST", "IMPLICIT")
