@@ -283,6 +283,8 @@ class Hook:
     def _accelerate(self, m, d, moving, first=False):
         """Computes the bodies' poses with the present models, in the worlds that continue."""
         going, correction, device = self._going.world, self._correction, d.qacc.device
+        if self._integrator.differs:
+            wp.launch(integrator.begin_correction, d.nworld, [going, correction], device=device)
         self._find_accelerations(m, d, moving, going, first)
         if self._integrator.differs:
 
@@ -298,7 +300,6 @@ class Hook:
                 self._find_accelerations(m, d, moving, correction.going)
                 compare()
 
-            wp.launch(integrator.begin_correction, d.nworld, [going, correction], device=device)
             compare()
             wp.capture_while(self._amiss, one_round)
         self._fork.run(*(functools.partial(batch.evaluate, m, d, self._integrator.qacc) for batch in moving))

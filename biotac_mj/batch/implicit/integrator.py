@@ -95,10 +95,14 @@ def _largest(m: vec6):
 
 @wp.kernel
 def begin_correction(going: wp.array(dtype=int), c: Correction):
-    """Begins one in the worlds that are going."""
+    """Begins one in the worlds that are going, before mujoco_warp's answer. Skins that do not act, or hold no
+    body, take none, whatever their last models took."""
     w = wp.tid()
     c.rounds[w] = 0
     c.going[w] = going[w]
+    for k in range(wp.where(going[w] == 1, c.force.shape[0], 0)):
+        if c.acts[k] == 0 or not holds(c.model, k, w):
+            c.force[k, w] = vec6()
 
 
 @wp.kernel
@@ -112,8 +116,7 @@ def find_amiss(
     again_out: wp.array(dtype=int),
 ):
     """After mujoco_warp's answer a, a' [world, dof]: what the correction lacks, and which worlds need another
-    one; sets again[0] where one does. Skins that do not act, or hold no body, lack nothing. One block per
-    world."""
+    one; sets again[0] where one does. One block per world."""
     w, t = wp.tid()
     if c.going[w] == 0:
         return
@@ -128,8 +131,6 @@ def find_amiss(
                 motion += c.square[k, w] * real(found[w, i] - moved[w, i]) * c.jacobian[k, w, i]
             excess = c.model.tangent0[k, w] * motion
             largest = wp.max(largest, _largest(c.model.wrench0[k, w]))
-        else:
-            c.force[k, w] = vec6()
         lacks = excess - c.force[k, w]
         c.amiss[k, w] = -lacks
         wrong = wp.max(wrong, _largest(lacks))
