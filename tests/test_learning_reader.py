@@ -328,3 +328,11 @@ def test_a_model_of_a_log_is_judged_on_a_set_and_back(tmp_path, capsys, monkeypa
     said = capsys.readouterr().out
     assert "place" not in said and "no better than the mean here" in said
     assert cli.main([*back[:-2], "--tare", "20"]) == 2 and "goes with --model" in capsys.readouterr().err
+
+
+def test_rows_that_a_model_learned_from_are_known(reader, tmp_path):
+    reader.save(tmp_path / "m.safetensors")
+    one, learned, new = Reader.load(tmp_path / "m.safetensors"), touches(160, 0), touches(160, 1)
+    assert one.known(learned.counts) == 1 and one.known(new.counts) == 0
+    mixed = np.concatenate([new.counts, np.repeat(learned.counts[::-1], 2, 0)])  # another order, some twice
+    assert abs(one.known(mixed) - 0.5) < 0.05 and one.known(learned.counts.astype(np.float32)[:80]) == 1

@@ -252,9 +252,9 @@ def _judge_model(args, recorded):
         data = from_recording(recording, args.tare)
     else:
         data, notes = from_set(args.source), []
-    if "source" in reader.meta and reader.meta["source"] == data.source:
-        notes = [*notes, f"{data.source} is the name of what the model was trained on, too"]
     scores = judge_on(reader, data)
+    if scores["known"] >= 0.005:
+        notes = [*notes, f"the model learned from {scores['known']:.0%} of these rows: they are no test"]
     _say_errors(scores)
     useless = [name for row in scores["targets"].values() for name in row["useless"]]
     for note in [*notes, *([f"{', '.join(useless)}: no better than the mean here"] if useless else [])]:
@@ -282,7 +282,8 @@ def _save_reader(args, reader, scores):
 
 def _say_errors(scores):
     for name, row in scores["targets"].items():
-        covered = "" if row["covered"] is None else f", {100 * row['covered']:.0f} % of unseen rows inside"
+        unseen = "" if scores.get("known") else "unseen "
+        covered = "" if row["covered"] is None else f", {100 * row['covered']:.0f} % of {unseen}rows inside"
         error = ""
         if row["rmse"] is not None:
             mean = f"the mean {row['rmse_of_mean']:.4g}"

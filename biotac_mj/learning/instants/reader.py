@@ -3,6 +3,7 @@ interval, and a novelty score against the training rows. Saved as one file."""
 
 import dataclasses
 import functools
+import hashlib
 import pathlib
 
 import numpy as np
@@ -21,6 +22,7 @@ TARGETS = {"force": ("fx", "fy", "fz"), "place": ("x", "y", "z"), "electrodes": 
 UNITS = {"force": "N", "place": "m", "electrodes": "counts"}
 _LEVEL = 0.9  # of the intervals
 _CODE = 8
+_KNOWN = 1024  # fingerprints of rows that a model keeps
 _SPACES = ("rows", "level")  # novelty of electrodes, and of baselines
 _FOLDS = 4  # of whole trajectories, for the choice of a ridge
 _RIDGE = (1e-4, 1e-3, 1e-2, 1e-1, np.inf)  # the last gives the mean
@@ -48,7 +50,8 @@ class Reader:
 
     Attributes:
       meta: description: "tared" (whether ln Z is relative to a tare), "level" of the intervals, "source",
-        "useless" (names of outputs that the touches held out do not show to be better than the mean).
+        "useless" (names of outputs that the touches held out do not show to be better than the mean),
+        "learned" (the least `fingerprints` of the rows that trained and calibrated it, rising).
       tensors: its parameters.
     """
 
@@ -100,6 +103,13 @@ class Reader:
         stuck = self._restored(StuckDetector, "moving")(x)
         novelty = np.where(stuck > 1, np.maximum(novelty, stuck), novelty)
         return Prediction(value, half, novelty)
+
+    def known(self, counts: np.ndarray) -> float:
+        """Share of different rows (n, nelectrode) that it learned from, estimated from those whose
+        fingerprints are as small as the kept ones."""
+        learned, found = self.meta.get("learned", []), fingerprints(counts)
+        found = [one for one in found if one <= max(learned, default="")]
+        return len({*found} & {*learned}) / max(len(found), 1)
 
     def _regress(self, name, x):
         out = 0.0
@@ -171,6 +181,12 @@ class Reader:
         return one
 
 
+def fingerprints(counts: np.ndarray) -> list[str]:
+    """Fingerprints of the different rows (n, nelectrode) [counts], rising."""
+    rows = np.ascontiguousarray(counts, np.float32)
+    return sorted({hashlib.blake2b(row.tobytes(), digest_size=6).hexdigest() for row in rows})
+
+
 def _stored(name, one):
     """Tensors of a dataclass of arrays."""
     return {f"{name}.{field.name}": getattr(one, field.name) for field in dataclasses.fields(one)}
@@ -237,6 +253,7 @@ def fit_reader(
             tensors |= {f"{name}.{k}.weight": weight, f"{name}.{k}.offset": offset}
     meta = {"tared": data.tared, "level": level, "source": data.source, "units": UNITS}
     meta |= {"train": len(train), "aside": len(kept), "synthetic": data.synthetic}
+    meta["learned"] = fingerprints(data.counts[fit | aside])[:_KNOWN]
     tensors |= {f"{name}.half": np.ones(1) for name in (*data.targets, "electrodes")}
     pdc = None if data.pdc is None else data.pdc[aside]
     raw = Reader(meta, tensors).predict(data.counts[aside], data.tare[aside], pdc)
@@ -287,13 +304,13 @@ def judge_in_time(data: Examples, fraction: float = 0.7, seed: int = 0) -> tuple
 
 
 def judge_on(reader: Reader, data: Examples) -> dict:
-    """Errors of a model on other data than it was trained on, beside those of these data's own mean.
+    """Errors of a model on data, beside those of these data's own mean; "known": as `Reader.known`.
 
     Raises:
       ValueError: a model of changes from rest where the data's rest is not known, or of other electrodes.
     """
     names = np.unique(data.owner)
-    return _scored(reader, data, names, names)[1]
+    return _scored(reader, data, names, names)[1] | {"known": reader.known(data.counts)}
 
 
 def _scored(reader, data, test, train):
