@@ -186,7 +186,7 @@ def test_ids_stand_once_and_parameters_lie_within_bounds(fits):
 def test_the_search_with_poses_has_the_effects_that_it_can_fit():
     assert entries("poses") == CATALOGUE and all("poses" in e.fits for e in CATALOGUE)
     assert {e.id for e in entries("log")} - {e.id for e in CATALOGUE} == {
-        *("count_offset", "count_gain", "flip", "stuck", "freeze"),
+        *("count_offset", "count_gain", "flip", "stuck", "force_late", "freeze"),
         *("lost_rows", "quantise", "spikes", "hum", "noise", "common_noise"),
     }
 

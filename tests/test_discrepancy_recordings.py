@@ -358,11 +358,17 @@ def test_a_wave_that_all_channels_have_is_taken_out():
     assert np.sqrt(np.mean(left**2)) < 0.5 * np.sqrt(np.mean(wave**2))
 
 
-def test_latency_is_measured():
+@pytest.mark.parametrize(
+    "name, rows", [("latency", 12), ("latency", 9), ("force_late", -7), ("force_late", -18)]
+)
+def test_latency_is_measured(name, rows):
+    """Of the electrodes, or of the force, which is no property of the sensor."""
     e, force, rng = pressed(5, 40)
-    d = diagnose_recording(PlainRecording(noisy(e, rng)[88:-12], force[100:]))
-    found = next(f for f in d.findings if f.id == "latency")
-    assert abs(found.parameters["delay"][0] - 0.12) < 0.01 and found.verified
+    d = diagnose_recording(PlainRecording(noisy(e, rng)[100 - rows : -20 - rows], force[100:-20]))
+    found = next(f for f in d.findings if f.id in ("latency", "force_late"))
+    assert found.id == name and abs(found.parameters["delay"][0] - abs(rows) / RATE) < 0.01 and found.verified
+    assert ("shift it so much earlier" in summary(d)) == (name == "force_late")
+    assert ("latency" in [effect.id for effect, _ in d.sensor().effects]) == (rows == 9)
 
 
 def test_a_frame_is_no_latency_and_a_metronome_no_rhythm():

@@ -113,6 +113,13 @@ class Stuck(Logged):
     confusable = {"saturate": "press harder: a stuck channel does not leave its value"}
 
 
+class LateForce(Logged):
+    id, name = "force_late", "late force log"
+    requires = frozenset({"force"})
+    physics = "the force's rows are of an earlier moment than the electrodes' beside them: of clock or logger"
+    params = {"delay": Param("s", 0.0, 0.5, "clocks and loggers")}
+
+
 class Freeze(Logged):
     id, name = "freeze", "held rows"
     physics = "rows repeat, or only noise follows: bus or logger"
@@ -228,6 +235,7 @@ LOGGED = (
     Flip(),
     ExchangeInLog(),
     Stuck(),
+    LateForce(),
     Freeze(),
     LostRows(),
     SaturationInLog(),

@@ -1,4 +1,4 @@
-"""Delay of the electrodes behind the force that is logged beside them.
+"""Delay of the electrodes behind the force that is logged beside them, or of the force behind them.
 
 The force is regressed on the electrodes (ln Z and products of its principal components, because they depend
 on the place of the contact, which force alone does not contain) by ridge regression, cross-validated on
@@ -17,7 +17,7 @@ from ....effects.effect import shifted
 from ....quality.evidence import sign_flip
 from ....sensor.channels import log_impedance
 from ...trajectories.base.nuisance import ages
-from ..candidates import Candidate
+from ..candidates import KINDS, Candidate
 from ..conditional import Components
 from ..recording import FORCE_MOVED
 from ..session import Session
@@ -84,7 +84,7 @@ def force_view(session: Session, rows: np.ndarray) -> ForceView | None:
 
 
 def delayed(session: Session) -> Candidate | None:
-    """A delay between force and electrodes, if the force is predicted better with it on blocks left out."""
+    """A delay of electrodes or force, if the force is predicted better with it on blocks left out."""
     view = force_view(session, session.fit)
     if view is None:
         return None
@@ -100,17 +100,21 @@ def delayed(session: Session) -> Candidate | None:
     # bootstrap over blocks
     rng = np.random.default_rng(0)
     draws = [table[:, rng.integers(0, _BLOCKS, _BLOCKS)].mean(1) for _ in range(200)]
-    delay, low, high = (
-        _vertex(delays, table.mean(1)),
-        *np.quantile([_vertex(delays, d) for d in draws], [0.025, 0.975]),
-    )
+    ends = np.quantile([_vertex(delays, d) for d in draws], [0.025, 0.975])
+    delay = _vertex(delays, table.mean(1))
+    found = f"errors of the force fall in {np.mean(gain > 0):.0%} of {_BLOCKS} blocks"
+    if delay < 0:
+        least = "at least" if best == 0 else "about"
+        found = f"the force log is late by {least} {-delay:.2g} s: shift it so much earlier; {found}"
+    kind = KINDS["force_late" if delay < 0 else "latency"]
+    size = min(abs(delay), kind.params["delay"].high)
     return Candidate(
-        "latency",
+        kind.id,
         tuple(range(session.counts.shape[1])),
         0.0,
         float(session.recording.time[-1]),
-        f"errors of the force fall in {np.mean(gain > 0):.0%} of {_BLOCKS} blocks",
-        {"delay": (delay, float(low), float(high))},
+        found,
+        {"delay": (size, *sorted(float(np.sign(delay) * end) for end in ends))},
         # half the summed log-error ratio, per independent second of a block
         nats=float(0.5 * 3 * gain.sum() * min(max(1.0, seconds / _BLOCKS), 20)),
         p=p,
