@@ -327,6 +327,11 @@ def test_a_model_of_a_log_is_judged_on_a_set_and_back(tmp_path, capsys, monkeypa
     assert cli.main([*back, "--tare", "20"]) == 0
     said = capsys.readouterr().out
     assert "place" not in said and "no better than the mean here" in said
+    assert "the model learned from 5% of these rows" in said  # the log has the touches of the set
+    (tmp_path / made).rename("another")
+    assert cli.main(["learn", "judge", "another", "--model", "set.safetensors"]) == 0
+    said = capsys.readouterr().out
+    assert "the model learned from 9" in said and "unseen" not in said  # a tenth was its test
     assert cli.main([*back[:-2], "--tare", "20"]) == 2 and "goes with --model" in capsys.readouterr().err
 
 

@@ -114,8 +114,7 @@ class SkinGeometry:
             if index.size and not 0 <= index.min() <= index.max() < count:
                 raise ValueError(
                     f"{name} of skin {self.name!r} names vertices {index.min()}..{index.max()}, "
-                    f"it has {count}: "
-                    "indices must be 0-based; import the mesh again"
+                    f"it has {count}: indices must be 0-based; import the mesh again"
                 )
 
     @property

@@ -79,8 +79,7 @@ class TetMesh:
         if count.max() > 2:
             raise ValueError(
                 f"{np.sum(count > 2)} faces belong to more than two tetrahedra, the first: "
-                f"{face[first[count > 2][0]].tolist()}: "
-                "remove duplicate or overlapping tetrahedra"
+                f"{face[first[count > 2][0]].tolist()}: remove duplicate or overlapping tetrahedra"
             )
         return np.ascontiguousarray(face[np.sort(first[count == 1])])
 
@@ -165,8 +164,7 @@ def check_closed(face: np.ndarray, name: str = "surface") -> None:
         where = edge[first[count > 2][0]].tolist()
         raise ValueError(
             f"the {name} is not a manifold: {np.sum(count > 2)} edges have more than two faces, the first "
-            f"joins vertices {where}: "
-            "separate the parts that touch along them"
+            f"joins vertices {where}: separate the parts that touch along them"
         )
     if len(np.unique(from_0 @ [number, 1])) != len(edge):
         raise ValueError(f"the {name} has faces of both orientations: make all normals point outwards")

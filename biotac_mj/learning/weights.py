@@ -241,8 +241,7 @@ def _refuse_other(meta, path, geometry, direction):
     if meta["nvert"] != geometry.nvert or meta["mesh"] != mesh_key(geometry):
         raise ValueError(
             f"{path} was trained on skin {meta['skin']!r} with {meta['nvert']} nodes and cannot read skin "
-            f"{geometry.name!r} with "
-            f"{geometry.nvert}: take that skin, or train on this one"
+            f"{geometry.name!r} with {geometry.nvert}: take that skin, or train on this one"
         )
 
 

@@ -176,8 +176,7 @@ def make_indenter(text: str) -> Indenter:
         return _from_file(description)
     if text not in INDENTERS:
         raise ValueError(
-            f"unknown indenter {text!r}: "
-            f"choose one of {', '.join(INDENTERS)}, or geom:TYPE:SIZE[,SIZE...] "
+            f"unknown indenter {text!r}: choose one of {', '.join(INDENTERS)}, or geom:TYPE:SIZE[,SIZE...] "
             "(geom:sphere:2.5mm is a sphere of that radius), or mesh:FILE"
         )
     shape = indenter(text)

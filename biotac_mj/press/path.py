@@ -158,8 +158,7 @@ def _refuse_larger(name, value, most, why, kind):
         usual, factor = list(UNITS[kind].items())[1]
         raise ValueError(
             f"{name} is {value:g} {SI[kind]}: {question(value, most, kind)}{most / factor:.4g} {usual} at "
-            "most, "
-            f"{why}"
+            f"most, {why}"
         )
 
 

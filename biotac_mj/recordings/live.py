@@ -134,8 +134,7 @@ def streams_of_lines(
     if table.width != len(names):
         raise ValueError(
             f"{port} sends {table.width} numbers a line, {len(names)} were expected "
-            f"({names[0]}..{names[-1]}): name them "
-            "with --columns"
+            f"({names[0]}..{names[-1]}): name them with --columns"
         )
     value = table.numbers(list(range(len(names))), names)
     skipped = len(list(lines)) - len(value)  # header

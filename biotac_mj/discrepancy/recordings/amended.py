@@ -3,13 +3,13 @@
 import numpy as np
 
 from ...effects.catalogue import by_id
+from ...effects.logged import WarmUpInLog
 from ...effects.sensor_file import SensorFile
 from ...geometry.skins import shipped_skin
 from ...recordings.own import rest_of
 from ...recordings.recording import designed
 from ...sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance
 from ...sensor.presets import PER_DEGREE
-from .candidates import KINDS
 from .session import Session
 
 _MATERIAL = "calibrated"  # the rubber that real sensors were matched with
@@ -51,7 +51,7 @@ def _warming(session, rest):
     if not drifts:
         return rest, {}
     rows, time = np.linspace(0, session.fit.sum() - 1, 200).astype(int), session.recording.time
-    warm = next((f for f in drifts if f.id == "warmup"), None)
+    warm = next((f for f in drifts if isinstance(f.kind, WarmUpInLog)), None)
 
     def drift_of(found):
         counts = np.tile(rest, (len(time), 1))
@@ -61,7 +61,7 @@ def _warming(session, rest):
 
     every, others = drift_of(drifts), drift_of([f for f in drifts if f is not warm])
     largest = every[:, np.ptp(every, axis=0).argmax()]
-    said = warm.parameters if warm else KINDS["warmup"].of_trend(time[rows], largest, None, None)
+    said = warm.parameters if warm else WarmUpInLog().of_trend(time[rows], largest, None, None)
     a, tau = said["a"][0] or 1e-9, said["tau"][0]
     rise = 1 - np.exp(-time[rows] / tau)
     size = np.linalg.lstsq(np.column_stack([rise, np.ones(len(rise))]), others, rcond=None)[0][0]

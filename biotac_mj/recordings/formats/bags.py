@@ -16,12 +16,10 @@ _REMEDY = "give a .bag of ROS 1, the folder of a ROS 2 bag, or its .mcap or .db3
 # definitions of biotac_sensors and tactile_msgs, which ROS does not include
 DEFINITIONS = {
     "biotac_sensors/msg/BioTacData": "string bt_serial\nuint16 bt_position\nuint16 tdc_data\nuint16 "
-    "tac_data\n"
-    "uint16 pdc_data\nuint16[22] pac_data\nuint16[19] electrode_data\n",
+    "tac_data\nuint16 pdc_data\nuint16[22] pac_data\nuint16[19] electrode_data\n",
     "biotac_sensors/msg/BioTacTime": "builtin_interfaces/Time frame_start_time\nbuiltin_interfaces/Time "
     "frame_end_time\nuint32 tdc_ns_offset\nuint32 tac_ns_offset\nuint32 pdc_ns_offset\nuint32[22] "
-    "pac_ns_offset\n"
-    "uint32[19] electrode_ns_offset\n",
+    "pac_ns_offset\nuint32[19] electrode_ns_offset\n",
     "biotac_sensors/msg/BioTacHand": "std_msgs/Header header\nstring hand_id\nBioTacData[] bt_data\n"
     "BioTacTime bt_time\n",
     "tactile_msgs/msg/TactileState": "std_msgs/Header header\nsensor_msgs/ChannelFloat32[] sensors\n",
