@@ -209,9 +209,8 @@ def _levels(recording, wrong):
     if recording.rest_correlation < REST_LIKE and not _dead(recording):
         out.append(
             f"rest levels are unlike known ones of a {recording.design.title.split(' (')[0]} (correlation "
-            f"{recording.rest_correlation:.2f}): "
-            "is this another sensor, or are the columns in another order than "
-            f"e1..e{recording.design.nelectrode}?"
+            f"{recording.rest_correlation:.2f}): is this another sensor, or are the columns in another order "
+            f"than e1..e{recording.design.nelectrode}?"
         )
     return out
 

@@ -70,9 +70,8 @@ def estimate_verb(args: argparse.Namespace) -> None:
     ]
     for row, one in zip(rows, found):
         print(
-            f"row {row}: centre {_pairs(1e3 * one.centre, 1e3 * one.centre_error)} mm, "
-            f"force {one.size:.3g} N ({one.low:.3g} to {one.high:.3g}), "
-            f"{100 * one.unexplained:.0f} % of the change unexplained"
+            f"row {row}: centre {_pairs(1e3 * one.centre, 1e3 * one.centre_error)} mm, force {one.size:.3g} "
+            f"N ({one.low:.3g} to {one.high:.3g}), {100 * one.unexplained:.0f} % of the change unexplained"
         )
         if one.deepest:
             print(

@@ -127,9 +127,8 @@ def check_columns(data: "TactileSet") -> None:
     for name in ("displacement", "counts", "measured_counts", "contact_force"):
         if name not in data.columns:
             raise ValueError(
-                f"{data.path} has no column {name}, only {', '.join(data.columns)}: a set with "
-                "deformed skin and readings comes from `biotac data generate --labelled N`, or `biotac data "
-                "resimulate`"
+                f"{data.path} has no column {name}, only {', '.join(data.columns)}: a set with deformed skin "
+                "and readings comes from `biotac data generate --labelled N`, or `biotac data resimulate`"
             )
 
 
