@@ -9,7 +9,7 @@ import warp as wp
 from blocks import shell, skin
 
 from biotac_mj.geometry import load_skin
-from biotac_mj.skin import PRESETS, GeomSet, Material, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.newton import convergence
 from biotac_mj.skin.newton.worlds import INSIDE_CORE
 from biotac_mj.skin.state_arrays import StateArrays
@@ -473,15 +473,3 @@ def test_options_that_the_data_was_not_made_for_are_refused(name, value):
 def test_options_that_could_not_act_are_refused(options, match):
     with pytest.raises(ValueError, match=match):
         SkinModel(finger().geometry, "default", SkinOptions(**options))
-
-
-def test_an_increment_of_a_light_press_takes_one_iteration():
-    """A tangent's product in each increment, and a second evaluation; only the first ones need more."""
-    model = SkinModel(load_skin("coarse"), PRESETS["paper"], SkinOptions(liquid=True, tolerance=3e-4))
-    data, sphere = SkinData(model), GeomSet(["sphere"], [(3.5e-3,)], [0.78])
-    spent = []
-    for depth in 0.04e-3 * np.arange(9):
-        sphere.set_pose([[-10e-3, -11.7e-3 + depth, 0]])
-        step(model, data, sphere)
-        spent.append([int(data.worlds.iterations.numpy()[0]), int(data.worlds.work.numpy()[0])])
-    assert spent[4:] == [[1, 2]] * 5

@@ -477,7 +477,7 @@ class SkinStep:
         self._launch(kernels.update_solution, chunks, inputs, [k.partial])
         self.put_inverse(self._launcher)
         self._decide(krylov.choose_beta, [k.partial, st], [self._solve_on])
-        self._launch(kernels.next_direction, d.x.shape, [k.z, st, k.p], [k.dx])
+        self._launch(kernels.next_direction, d.x.shape, [k.z, st, k.p])
 
     def _search(self):
         self._take_full_step()

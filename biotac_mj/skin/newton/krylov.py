@@ -12,7 +12,7 @@ from ..contact.faces import block_index
 from ..types import Precision, real, vec3
 from .line_search import begin_line_search
 from .nodes import LiquidForces, NodeSlots, SurfaceForces
-from .worlds import Worlds, totals_of
+from .worlds import Worlds, total_of, totals_of
 
 kernel_module(__name__)
 
@@ -87,35 +87,25 @@ def choose_alpha(limit: int, partial: wp.array3d(dtype=real), st: Worlds):
 
 @wp.kernel
 def choose_beta(partial: wp.array3d(dtype=real), st: Worlds, any_active: wp.array(dtype=int)):
-    """Ends the linear solve of world w if it has reduced r . z to a hundredth, or along the next direction,
-    without a product there. partial: r . z, gradient . z."""
+    """Ends the linear solve of world w if it has reduced r . z to a hundredth, or if its last step length was
+    near one. partial: r . z."""
     w, t = wp.tid()
     if st.running[w] == 0:
-        if t == 0:
-            st.beta[w] = real(0.0)
         return
     first = st.start_rz[w]
     before = st.rz[w]
     alpha = st.alpha[w]
-    change = alpha * st.kappa[w]
-    response = alpha * st.pressure_response[w]
-    predicted = st.predicted_pressure[w]
-    total = totals_of(partial, w, t)
+    rz = total_of(partial, 0, w, t)
     if t > 0:
         return
-    rz = total[0]
-    beta = rz / before
     st.rz[w] = rz
-    if wp.abs(alpha - real(1.0)) <= real(0.2) and beta > real(0.0) and beta < real(1.0):
-        # a step length near one: the preconditioner is as accurate as the tangent, for the next direction too
-        st.running[w] = 0
-        st.predicted_pressure[w] = predicted - change * total[1] - beta * response
-    elif rz > real(0.01) * wp.abs(first):
+    # a step length near one: the preconditioner is as accurate as the tangent where the load acts. What is
+    # left lies where it is not: a motion along it needs a product, which the next tangent has better
+    if rz > real(0.01) * wp.abs(first) and wp.abs(alpha - real(1.0)) > real(0.2):
+        st.beta[w] = rz / before
         any_active[0] = 1
     else:
         st.running[w] = 0
-        beta = real(0.0)
-    st.beta[w] = beta
 
 
 @functools.cache
@@ -280,16 +270,11 @@ def _update_kernels(precision):
         partial_out[0, c, w] = rr
 
     @wp.kernel(module=module)
-    def next_direction(
-        z: wp.array2d(dtype=vec), st: Worlds, p: wp.array2d(dtype=vec), dx: wp.array2d(dtype=vec)
-    ):
-        """p = z + beta p at node i, or the last motion along it, of the length of the one before."""
+    def next_direction(z: wp.array2d(dtype=vec), st: Worlds, p: wp.array2d(dtype=vec)):
+        """p = z + beta p at node i."""
         i, w = wp.tid()
-        beta = scalar(st.beta[w])
         if st.running[w] == 1:
-            p[i, w] = z[i, w] + beta * p[i, w]
-        elif beta > scalar(0.0):
-            dx[i, w] = dx[i, w] + scalar(st.alpha[w]) * (z[i, w] + beta * p[i, w])
+            p[i, w] = z[i, w] + scalar(st.beta[w]) * p[i, w]
 
     return {"update_solution": update_solution, "next_direction": next_direction}
 
