@@ -634,6 +634,11 @@ def test_a_straight_drift_is_no_long_warm_up():
     assert a * (1 - np.exp(-200 / tau)) == pytest.approx(-0.1, rel=0.05)
 
 
+def test_the_warm_up_of_no_change_is_none():
+    found = KINDS["warmup"].of_trend(np.linspace(0.0, 200.0, 50), np.zeros(50), np.ones(19), np.ones(19))
+    assert found["a"][0] == 0.0
+
+
 @pytest.mark.parametrize("seconds", (5, 9))
 def test_short_touches_have_no_warm_up_and_still_logs_do(seconds):
     """What the report says cannot be told from touches is not named; one touch in one window is enough."""

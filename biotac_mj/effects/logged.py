@@ -205,7 +205,7 @@ class WarmUpInLog(WarmUp, SharedLevel):
             fits.append((float(((y - basis @ w) ** 2).sum()), tau, w[0]))
         fits = [f for f in fits if self.params["a"].low <= f[2] <= self.params["a"].high] or fits
         off = 0.5 * min(fits)[0] + 1e-4 * (y**2).sum()
-        near, nearly = ([f for f in fits if f[0] < min(fits)[0] + part * off] for part in (1.0, 0.5))
+        near, nearly = ([f for f in fits if f[0] <= min(fits)[0] + part * off] for part in (1.0, 0.5))
         least = min(nearly, key=lambda f: abs(f[2]))
         return {
             name: (least[i], min(f[i] for f in near), max(f[i] for f in near))
