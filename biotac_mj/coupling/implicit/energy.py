@@ -22,15 +22,16 @@ _beta_of, _fraction_within = (wp.func(rule) for rule in (beta_of, fraction_withi
 
 @wp.func
 def given(r: Rounds, g: int, w: int):
-    """Work of the skin's forces on a body along its motion in the step [J], and of the core's contact while
-    the skin pushes it; without forces that were lost before the step."""
+    """Work of the skin's forces on a body along its motion in the step [J], and what the core's contact lifts
+    it by while the skin pushes it; without forces that were lost before the step. What that contact takes in
+    may come from another body that presses this one onto the core: the skin has not got it."""
     acts = r.acting[g, w]
     if acts == vec6():  # whatever lifts the body, the skin gives nothing
         return real(0.0)
     motion = r.straight[g, w]
     if not (is_finite(r.here_pos[g, w], r.here_mat[g, w]) and wp.isfinite(wp.dot(motion, motion))):
         return real(0.0)
-    return wp.dot(acts, r.travel[g, w]) + r.lifted[g, w]
+    return wp.dot(acts, r.travel[g, w]) + wp.max(r.lifted[g, w], real(0.0))
 
 
 @wp.func
